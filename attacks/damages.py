@@ -31,22 +31,22 @@ from live import RAW, Driver
 
 from attacks.support import HOSTILE, damaged, main, mutated, scratch
 from hilbo import Study
-from hilbo.cli.console import results
+from hilbo.app.pages.session_views import experimenter_view, participant_view
+from hilbo.cli.terminal.console import results
 from hilbo.errors import InputError
 from hilbo.report.participants import json_lines
 from hilbo.report.results import map_dataset
-from hilbo.session import export
-from hilbo.session.event_log import EventLog, read_session
-from hilbo.session.participants import add_person, read_people
-from hilbo.session.plan import make_plan, plan_hash, planned_header, read_plan
-from hilbo.session.plan_sets import aggregate_best_sets
-from hilbo.session.views import experimenter_view, participant_view
-from hilbo.session.warm_start import read_warm_start
-from hilbo.study.map_file import write_map
-from hilbo.study.result_file import read_result
-from hilbo.study.trial_table import read_trials, write_trials
-from hilbo.study.typed_files import sealed
-from hilbo.study.validation_table import read_validation, sets_frame
+from hilbo.session.choose.warm_start import read_warm_start
+from hilbo.session.export import tables as log_tables
+from hilbo.session.log.event_log import EventLog, read_session
+from hilbo.session.plan.participants import add_person, read_people
+from hilbo.session.plan.plan import make_plan, plan_hash, planned_header, read_plan
+from hilbo.session.plan.validation_sets import aggregate_best_sets
+from hilbo.study.formats.json_file import sealed
+from hilbo.study.results.map_netcdf import write_map
+from hilbo.study.results.result_json import read_result
+from hilbo.study.tables.trials import read_trials, write_trials
+from hilbo.study.tables.validation import read_validation, sets_frame
 
 __all__ = ["damage_case"]
 
@@ -163,7 +163,12 @@ def _read_log(path: Path) -> Any:
     """Header and events as plain data; after everything that is made of a log."""
     state = read_session(path, PLAIN)
     if state.trials:
-        for table in (export.trials_table, export.validation_table, export.sets_table, export.presentations_table):
+        for table in (
+            log_tables.trials_table,
+            log_tables.validation_table,
+            log_tables.sets_table,
+            log_tables.presentations_table,
+        ):
             table([state])
     msgspec.json.encode(participant_view(state)), msgspec.json.encode(experimenter_view(state))
     lines = [json.loads(line) for line in path.read_bytes().split(b"\n")[: state.seq + 1]]
@@ -331,7 +336,7 @@ def _forged_plan(rng: random.Random, content: bytes) -> bytes:
 def _tables(folder: Path) -> tuple[Path, Path, Path]:
     """The exported tables of the two logs."""
     sessions = [read_session(path, PLAIN) for path in sorted(folder.glob("*.session.jsonl"))]
-    made = (export.trials_table(sessions), export.validation_table(sessions), export.sets_table(sessions))
+    made = (log_tables.trials_table(sessions), log_tables.validation_table(sessions), log_tables.sets_table(sessions))
     paths = tuple(folder / f"{name}.csv" for name in ("trials", "validation", "sets"))
     for table, path in zip(made, paths, strict=True):
         write_trials(table, path)

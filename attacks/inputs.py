@@ -30,14 +30,14 @@ import pandas as pd
 
 from attacks.support import HOSTILE, damaged, main, mutated, scratch
 from hilbo.errors import InputError
-from hilbo.session.participants import read_people
+from hilbo.session.plan.participants import read_people
 from hilbo.statistics.paper_tables import paper_tables
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
 from hilbo.study.folder import read_folder
-from hilbo.study.text_cells import is_id, runs_in_a_spreadsheet
-from hilbo.study.trial_table import read_trials
-from hilbo.study.validation_table import read_validation, sets_frame
+from hilbo.study.formats.cell_text import is_id, runs_in_a_spreadsheet
+from hilbo.study.tables.trials import read_trials
+from hilbo.study.tables.validation import read_validation, sets_frame
 
 __all__ = ["input_case"]
 

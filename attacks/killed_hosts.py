@@ -21,8 +21,8 @@ from simulated import ENVIRONMENT
 
 from attacks.support import main
 from hilbo.device.link import Link
+from hilbo.device.local.simulator import Simulator
 from hilbo.device.ports import open_port
-from hilbo.device.simulator import Simulator
 from hilbo.hardware_bridge import Renderer, State
 
 __all__ = ["BOUND", "Killed", "Killing"]

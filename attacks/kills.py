@@ -24,9 +24,9 @@ sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / 
 from killed_session import PATIENCE, Session
 
 from attacks.support import main
-from hilbo.app.rehearsal import fast_study
-from hilbo.session.event_log import read_log
-from hilbo.session.state import LiveSession
+from hilbo.app.rehearsal.rehearsal import fast_study
+from hilbo.session.log.event_log import read_log
+from hilbo.session.log.state import LiveSession
 from hilbo.study.config import Study
 
 __all__ = ["Kills"]

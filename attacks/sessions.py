@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from hilbo.app.rehearsal import HILBO, fast_study
-from hilbo.app.robot import Client
+from hilbo.app.rehearsal.rehearsal import HILBO, fast_study
+from hilbo.app.rehearsal.robot import Client
 
 __all__ = ["Session", "session"]
 

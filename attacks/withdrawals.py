@@ -23,7 +23,7 @@ import xarray as xr
 
 from attacks.support import main, scratch
 from hilbo.cli import main as hilbo_main
-from hilbo.cli.console import start
+from hilbo.cli.terminal.console import start
 
 PEOPLE, JUDGES = 24, 2
 SENTENCES = re.compile(r"Traceback|Error:")
@@ -103,7 +103,7 @@ def _run(*command: str) -> str:
 
 def _resume_all() -> None:
     """Everybody else's session can be gone on with."""
-    from hilbo.session.event_log import EventLog
+    from hilbo.session.log.event_log import EventLog
     from hilbo.study.config import Study
 
     study = Study.load("study.toml")
@@ -173,8 +173,8 @@ def _quick_validation(folder: Path) -> None:
 
     from hilbo.simulation.presets import PRESETS
     from hilbo.simulation.validation_sessions import sets_table, validation_table
+    from hilbo.study.analysis.tolerance import Sets
     from hilbo.study.config import Study
-    from hilbo.study.map_summary import Sets
 
     study = Study.load(folder / "study.toml")
     count = pd.read_csv(folder / "trials.csv")["participant"].nunique()
@@ -199,9 +199,9 @@ class _Given:
 
 def _logs(folder: Path) -> None:
     """The trial table's answers as logs of the sessions in which they were given."""
-    from hilbo.session import actions
-    from hilbo.session.event_log import EventLog, log_name
-    from hilbo.session.headers import header_for
+    from hilbo.session.log import actions
+    from hilbo.session.log.event_log import EventLog, log_name
+    from hilbo.session.log.header import header_for
     from hilbo.study.config import Study
 
     study, table = Study.load("study.toml"), pd.read_csv("trials.csv")
@@ -218,9 +218,9 @@ def _logs(folder: Path) -> None:
 
 def _judged(folder: Path) -> None:
     """Logs of people who compared the population's set with everybody's own."""
-    from hilbo.session.event_log import log_name
-    from hilbo.session.logged_session import LoggedSession
-    from hilbo.session.plan import planned_header
+    from hilbo.session.choose.logged_session import LoggedSession
+    from hilbo.session.log.event_log import log_name
+    from hilbo.session.plan.plan import planned_header
     from hilbo.study.config import Study
 
     study = Study.load("study.toml")

@@ -50,7 +50,7 @@ def compare(study, trials):
     from hilbo import acquisition
     from hilbo.numerics import climbing
     from hilbo.ordinal_gp import fit
-    from hilbo.session import selection
+    from hilbo.session.choose import selection
 
     space, plan = study.space, selection.design(study, 0)
     many = jnp.asarray(space.candidates(POINTS, 0))

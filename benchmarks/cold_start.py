@@ -22,13 +22,13 @@ STUDY = f"from hilbo import Session, Study\nstudy = Study.load({str(ROOT / 'hilb
 START = "session = Session.start(study)\n"
 ANSWERS = "for _ in range(5): session = session.tell('different')\nsession.ask()\n"
 WHOLE = X64 + STUDY + START + ANSWERS
-KEPT = WHOLE.replace(X64, "from hilbo.cli.console import start; start()\n")
+KEPT = WHOLE.replace(X64, "from hilbo.cli.terminal.console import start; start()\n")
 PROCESSES = {
     "bare `python`": "",
     "`import jax`": "import jax",
     "`import jax`, one compiled function": X64 + "import jax.numpy as jnp; jax.jit(lambda a: a @ a)(jnp.ones((3, 3)))",
     "`import hilbo`": "import hilbo",
-    "`hilbo.session.ask_tell` imported": X64 + "import hilbo.session.ask_tell",
+    "`hilbo.session.choose.ask_tell` imported": X64 + "import hilbo.session.choose.ask_tell",
     "study loaded": X64 + STUDY,
     "session started: the first point to show": X64 + STUDY + START,
     "first chosen point, after 5 answers": WHOLE,

@@ -22,7 +22,7 @@ from pages import put  # noqa: E402
 from populations import by_chance  # noqa: E402
 from populations_people import FEATURES, PAPER  # noqa: E402
 
-from hilbo.population.response_quality import measure_people  # noqa: E402
+from hilbo.population.judged.response_quality import measure_people  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
 

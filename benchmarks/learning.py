@@ -32,18 +32,18 @@ import numpy as np  # noqa: E402
 from populations import chance_at  # noqa: E402
 from populations_people import POPULATIONS  # noqa: E402
 
-from hilbo.population.learnt import learn  # noqa: E402
-from hilbo.population.learnt_posterior import LEFT  # noqa: E402
-from hilbo.population.low_rank import shared_evidence  # noqa: E402
+from hilbo.population.learnt.posterior import LEFT  # noqa: E402
+from hilbo.population.learnt.recipes import LEARNT_1, RECIPES  # noqa: E402
+from hilbo.population.learnt.rule import learn  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
-from hilbo.population.recipes import LEARNT_1, RECIPES  # noqa: E402
-from hilbo.population.shared_features import pivots_of  # noqa: E402
-from hilbo.population.tallies import tallied  # noqa: E402
+from hilbo.population.shared.features import pivots_of  # noqa: E402
+from hilbo.population.shared.low_rank import shared_evidence  # noqa: E402
+from hilbo.population.shared.tallies import tallied  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
-from hilbo.study.learnt_study import that_learns  # noqa: E402
-from hilbo.study.optima import map_optimum  # noqa: E402
+from hilbo.study.estimate.learnt import that_learns  # noqa: E402
+from hilbo.study.estimate.optimum import map_optimum  # noqa: E402
 
 PAGE = Path(__file__).parents[1] / "docs" / "methods" / "which_method.md"
 POPULATION = POPULATIONS["paper-individuals"]

@@ -20,14 +20,14 @@ from pathlib import Path
 import numpy as np
 from pages import put
 
-from hilbo.app.rehearsal import Decider, fast_study, server
-from hilbo.app.robot import Client
-from hilbo.cli.console import start
-from hilbo.session.actions import answer, present, propose
-from hilbo.session.ask_tell import Session
-from hilbo.session.headers import header_for
-from hilbo.session.look_ahead import LiveChooser
-from hilbo.session.state import LiveSession
+from hilbo.app.rehearsal.rehearsal import Decider, fast_study, server
+from hilbo.app.rehearsal.robot import Client
+from hilbo.cli.terminal.console import start
+from hilbo.session.choose.ask_tell import Session
+from hilbo.session.choose.look_ahead import LiveChooser
+from hilbo.session.log.actions import answer, present, propose
+from hilbo.session.log.header import header_for
+from hilbo.session.log.state import LiveSession
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 from pages import put
 
-from hilbo.app.rehearsal import server
-from hilbo.app.robot import Client
-from hilbo.cli.console import start
-from hilbo.study.new_study import NewStudy, parameter_of, study_text
+from hilbo.app.rehearsal.rehearsal import server
+from hilbo.app.rehearsal.robot import Client
+from hilbo.cli.terminal.console import start
+from hilbo.study.template import NewStudy, parameter_of, study_text
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "clients"))

@@ -17,13 +17,13 @@ from populations import by_recipe, chance_at, with_trials
 from populations_people import POPULATIONS
 from rows import Rows
 
-from hilbo.population.baselines import quadratic
-from hilbo.population.leave_one_out import clustered, leave_one_out_learnt
-from hilbo.population.recipes import RECOMMENDED
+from hilbo.population.judged.baselines import quadratic
+from hilbo.population.judged.leave_one_out import clustered, leave_one_out_learnt
+from hilbo.population.learnt.recipes import RECOMMENDED
 from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import simulate_study
+from hilbo.study.analysis.model_check import _compared, _differs
 from hilbo.study.cohort import Cohort
-from hilbo.study.model_check import _compared, _differs
 
 PEOPLE, TRIALS, FIRST, GROUPS = 24, 25, 50, 12
 NAMES = (

@@ -34,14 +34,14 @@ from pages import put  # noqa: E402
 from people_evidence import learn_people  # noqa: E402
 
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials  # noqa: E402
-from hilbo.population.baselines import constant, quadratic  # noqa: E402
-from hilbo.population.counts import Counts, fit_counts  # noqa: E402
-from hilbo.population.learnt import learn  # noqa: E402
-from hilbo.population.leave_one_out import clustered, integral_transform  # noqa: E402
+from hilbo.population.judged.baselines import constant, quadratic  # noqa: E402
+from hilbo.population.judged.leave_one_out import clustered, integral_transform  # noqa: E402
+from hilbo.population.learnt.recipes import LEARNT_1, LEARNT_2, RECIPES  # noqa: E402
+from hilbo.population.learnt.rule import learn  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
 from hilbo.population.newcomer import class_probabilities  # noqa: E402
 from hilbo.population.pointwise import RULES, aggregate  # noqa: E402
-from hilbo.population.recipes import LEARNT_1, LEARNT_2, RECIPES  # noqa: E402
+from hilbo.population.shared.counts import Counts, fit_counts  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 WORDS = {

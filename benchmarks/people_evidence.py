@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.ordinal_gp import OrdinalGP
-from hilbo.population.counts import Counts, evidence
+from hilbo.population.shared.counts import Counts, evidence
 
 __all__ = ["LearntPeople", "learn_people"]
 

@@ -35,17 +35,17 @@ from rows import Rows  # noqa: E402
 
 from hilbo import acquisition  # noqa: E402
 from hilbo.ordinal_gp import Trials  # noqa: E402
-from hilbo.population.leave_one_out import clustered  # noqa: E402
+from hilbo.population.judged.leave_one_out import clustered  # noqa: E402
+from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.population.maps import learnt_map, rule_map  # noqa: E402
-from hilbo.population.recipes import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
-from hilbo.study.aggregate import fit_cohort  # noqa: E402
+from hilbo.study.analysis.region import optimum_region  # noqa: E402
 from hilbo.study.cohort import Cohort  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
-from hilbo.study.learnt_study import resolved, that_learns  # noqa: E402
-from hilbo.study.optima import individual_optima, map_optimum  # noqa: E402
-from hilbo.study.optimum_region import optimum_region  # noqa: E402
+from hilbo.study.estimate.aggregate import fit_cohort  # noqa: E402
+from hilbo.study.estimate.learnt import resolved, that_learns  # noqa: E402
+from hilbo.study.estimate.optimum import individual_optima, map_optimum  # noqa: E402
 
 FIRST = 1000  # seed of what is reported
 MEDIANS = " by medians"

@@ -28,7 +28,7 @@ from hilbo import Study, acquisition, bcm, fit, passivity, viscoelastic  # noqa:
 from hilbo.errors import InputError  # noqa: E402
 from hilbo.hyperparameters.maximum_evidence import maximise_evidence  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
-from hilbo.study.optima import best_point  # noqa: E402
+from hilbo.study.estimate.optimum import best_point  # noqa: E402
 from hilbo.viscoelastic import FOSLS  # noqa: E402
 
 __all__ = ["main"]

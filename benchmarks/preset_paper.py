@@ -19,10 +19,10 @@ def one_study(study, seed, candidates):
     from hilbo.search.apart import nrmse
     from hilbo.simulation import simulate
     from hilbo.simulation.presets import PRESETS
-    from hilbo.study.aggregate import aggregate_cohort
+    from hilbo.study.analysis.progress import follow
     from hilbo.study.cohort import Cohort
-    from hilbo.study.optima import population_optimum
-    from hilbo.study.progress import follow
+    from hilbo.study.estimate.aggregate import aggregate_cohort
+    from hilbo.study.estimate.optimum import population_optimum
 
     population = PRESETS["paper-individuals"]
     truth = np.asarray(study.space.to_unit(np.array([population.truth[name] for name in study.space.names])))

@@ -29,11 +29,11 @@ from hilbo.errors import InputError  # noqa: E402
 from hilbo.population.maps import rule_map  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import Population, people, simulate_study  # noqa: E402
-from hilbo.study.aggregate import fit_cohort  # noqa: E402
+from hilbo.study.analysis.tolerance import best_mid_worst  # noqa: E402
 from hilbo.study.cohort import Cohort  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
-from hilbo.study.map_summary import best_mid_worst  # noqa: E402
-from hilbo.study.optima import individual_optima  # noqa: E402
+from hilbo.study.estimate.aggregate import fit_cohort  # noqa: E402
+from hilbo.study.estimate.optimum import individual_optima  # noqa: E402
 
 DATA = Path(__file__).parents[1] / "hilbo" / "data"
 FILE, STUDY = DATA / "populations.toml", Study.load(DATA / "paper.toml")

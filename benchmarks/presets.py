@@ -24,16 +24,16 @@ from preset_search import CROWD, STUDY, distance, individuals, truth_of, validat
 from rows import Rows  # noqa: E402
 
 from hilbo.errors import InputError  # noqa: E402
+from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.population.maps import learnt_map, rule_map  # noqa: E402
-from hilbo.population.recipes import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.presets import PRESETS  # noqa: E402
 from hilbo.simulation.simulate import people, simulate_study  # noqa: E402
-from hilbo.study.aggregate import fit_cohort  # noqa: E402
+from hilbo.study.analysis.tolerance import best_mid_worst, slice_through  # noqa: E402
 from hilbo.study.cohort import Cohort  # noqa: E402
-from hilbo.study.learnt_study import resolved, that_learns  # noqa: E402
-from hilbo.study.map_summary import best_mid_worst, slice_through  # noqa: E402
-from hilbo.study.optima import individual_optima, map_optimum  # noqa: E402
+from hilbo.study.estimate.aggregate import fit_cohort  # noqa: E402
+from hilbo.study.estimate.learnt import resolved, that_learns  # noqa: E402
+from hilbo.study.estimate.optimum import individual_optima, map_optimum  # noqa: E402
 
 PAGE = Path(__file__).parents[1] / "docs" / "methods" / "simulation.md"
 RULES = ("bcm", *RECIPES)

@@ -20,9 +20,9 @@ from populations import by_chance, by_recipe, cohort_from, highest, rounded, wit
 from populations_people import FEATURES, PAPER, ChanceOfFunctions, Drawn, Scene
 from rows import Rows
 
-from hilbo.population.recipes import LEARNT_1, RECOMMENDED
+from hilbo.population.learnt.recipes import LEARNT_1, RECOMMENDED
 from hilbo.search.candidates import search_points
-from hilbo.study.optimum_region import optimum_region
+from hilbo.study.analysis.region import optimum_region
 
 CATEGORIES, FREEDOM = 3, 3  # Matern 3/2: waves are Student's, with 3 degrees of freedom
 

@@ -17,10 +17,10 @@ from hilbo.acquisition import UCB
 from hilbo.hyperparameters.maximum_evidence import maximise_evidence
 from hilbo.ordinal_gp import Trials, fit
 from hilbo.search.lattice import screen_points
-from hilbo.session.ask_tell import Session
-from hilbo.study.aggregate import fit_cohort
+from hilbo.session.choose.ask_tell import Session
 from hilbo.study.config import Study
-from hilbo.study.optima import predict_people
+from hilbo.study.estimate.aggregate import fit_cohort
+from hilbo.study.estimate.optimum import predict_people
 
 PAPER = Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml"
 

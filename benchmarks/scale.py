@@ -132,10 +132,10 @@ def cohort_of_people(study, people):
 
 def run_cpu(people, agree=None):
     """One size in this process, or one process's part of an agreement."""
-    from hilbo.cli.console import start
+    from hilbo.cli.terminal.console import start
 
     start()
-    from hilbo.study.distributed import crew
+    from hilbo.study.estimate.distributed import crew
 
     with crew(agree is not None, *(agree or ())) as team:
         return agreed(team, people) if agree else sized(team, people)
@@ -144,9 +144,9 @@ def run_cpu(people, agree=None):
 def agreed(team, people):
     import numpy as np
 
-    from hilbo.study import batch
     from hilbo.study.cohort import cohort_of
     from hilbo.study.config import Study
+    from hilbo.study.estimate import batch
 
     study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
     table = cohort_of_people(study, people)
@@ -163,11 +163,11 @@ def sized(team, people):
 
     import numpy as np
 
-    from hilbo.study import batch
-    from hilbo.study.batch_optimum import optima_from
     from hilbo.study.cohort import cohort_of
     from hilbo.study.config import Study
-    from hilbo.study.trial_table import read_trials
+    from hilbo.study.estimate import batch
+    from hilbo.study.estimate.batch_optimum import optima_from
+    from hilbo.study.tables.trials import read_trials
 
     study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
     points = study.space.candidates(POINTS, 0)
@@ -216,7 +216,7 @@ sys.path[:0] = ["{root}", "{root}/benchmarks"]
 import jax; jax.config.update("jax_enable_x64", True)
 import scale
 from hilbo.study.config import Study
-from hilbo.study.trial_table import write_trials
+from hilbo.study.tables.trials import write_trials
 write_trials(scale.cohort_of_people(Study.load("{root}/hilbo/data/paper.toml"), {people}), "{path}")
 """
 
@@ -225,12 +225,12 @@ def run_gpu(people):
     """Refit and merge on the GPU: no line here says that it is one, but for its memory."""
     import jax
 
-    from hilbo.cli.console import start
+    from hilbo.cli.terminal.console import start
 
     start()
-    from hilbo.study import batch, distributed
     from hilbo.study.cohort import cohort_of
     from hilbo.study.config import Study
+    from hilbo.study.estimate import batch, distributed
 
     device = jax.devices()[0]
     if device.platform == "cpu":

@@ -22,11 +22,11 @@ import numpy as np
 from hilbo import Study
 from hilbo.ordinal_gp import Trials, fit
 from hilbo.search.candidates import search_points
-from hilbo.session.selection import design, point_after
-from hilbo.session.warm_start import warm_point, warm_start
+from hilbo.session.choose.selection import design, point_after
+from hilbo.session.choose.warm_start import warm_point, warm_start
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import Person, people, simulate_study
-from hilbo.study.optima import predict_people
+from hilbo.study.estimate.optimum import predict_people
 
 TRIALS = 25
 

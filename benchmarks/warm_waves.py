@@ -30,13 +30,13 @@ from populations_people import POPULATIONS  # noqa: E402
 from rows import Rows  # noqa: E402
 
 from hilbo.ordinal_gp import Trials, fit  # noqa: E402
+from hilbo.population.learnt.recipes import RECOMMENDED  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
-from hilbo.population.recipes import RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
-from hilbo.session.warm_start import warm_point, warm_start  # noqa: E402
+from hilbo.session.choose.warm_start import warm_point, warm_start  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
-from hilbo.study.learnt_study import resolved, that_learns  # noqa: E402
-from hilbo.study.optima import predict_map  # noqa: E402
+from hilbo.study.estimate.learnt import resolved, that_learns  # noqa: E402
+from hilbo.study.estimate.optimum import predict_map  # noqa: E402
 
 NAMES = (
     "paper-individuals",

@@ -19,8 +19,8 @@ import time
 from hilbo_stimulus import Stimulus, StimulusError
 
 from hilbo.device.failures import DeviceError
-from hilbo.device.library import Fate, HostRenderer, K0_of
-from hilbo.device.motor import MOTOR, SimulatedMotor
+from hilbo.device.local.library import Fate, HostRenderer, K0_of
+from hilbo.device.local.motor import MOTOR, SimulatedMotor
 from hilbo.device.reasons import State
 from hilbo.errors import InputError
 

@@ -41,7 +41,7 @@ _names, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "errors": ["InputError"],
         "ordinal_gp": ["RBF", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"],
-        "session.ask_tell": ["Session"],
+        "session.choose.ask_tell": ["Session"],
         "study.config": ["Study"],
     },
 )
@@ -81,7 +81,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors; a test compar
     from hilbo.ordinal_gp import Posterior as Posterior
     from hilbo.ordinal_gp import Trials as Trials
     from hilbo.ordinal_gp import fit as fit
-    from hilbo.session.ask_tell import Session as Session
+    from hilbo.session.choose.ask_tell import Session as Session
     from hilbo.study.config import Study as Study
 
     __version__: str

@@ -93,7 +93,7 @@ class Renderer:
         which no device of this protocol answers.
         """
         if where == "sim":
-            from hilbo.device.simulator import Simulator
+            from hilbo.device.local.simulator import Simulator
 
             simulator = Simulator(**(options or {}))
         elif options:

@@ -18,14 +18,14 @@ import numpy as np
 
 import hilbo
 from hilbo import Study
-from hilbo.report.comparison import comparison_table
 from hilbo.report.figures.population import rules_figure
+from hilbo.report.study.comparison import comparison_table
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import people, simulate_study, to_table
-from hilbo.study.aggregate import aggregate_cohort
+from hilbo.study.analysis.rule_comparison import compare
 from hilbo.study.cohort import Cohort, cohort_of
-from hilbo.study.rule_comparison import compare
-from hilbo.study.trial_table import read_trials
+from hilbo.study.estimate.aggregate import aggregate_cohort
+from hilbo.study.tables.trials import read_trials
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 

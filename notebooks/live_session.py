@@ -14,13 +14,13 @@ import time
 from pathlib import Path
 
 import hilbo
-from hilbo.app.rehearsal import Decider
+from hilbo.app.pages.session_views import participant_view
+from hilbo.app.rehearsal.rehearsal import Decider
 from hilbo.hardware_bridge import Renderer
-from hilbo.session.actions import answer, go_on, present, propose, sent
-from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.headers import header_for
-from hilbo.session.look_ahead import LiveChooser
-from hilbo.session.views import participant_view
+from hilbo.session.choose.look_ahead import LiveChooser
+from hilbo.session.log.actions import answer, go_on, present, propose, sent
+from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.log.header import header_for
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 

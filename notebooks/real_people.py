@@ -19,12 +19,12 @@ import pandas as pd
 
 import hilbo
 from hilbo import Study
-from hilbo.population.response_quality import excluded, measure_people
+from hilbo.population.judged.response_quality import excluded, measure_people
 from hilbo.report.figures.people import people_figure
 from hilbo.search.apart import nrmse
-from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import cohort_of
-from hilbo.study.trial_table import read_trials, write_trials
+from hilbo.study.estimate.aggregate import aggregate_cohort
+from hilbo.study.tables.trials import read_trials, write_trials
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 

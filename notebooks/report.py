@@ -18,16 +18,16 @@ import pandas as pd
 
 import hilbo
 from hilbo import Study
-from hilbo.report.study import write_study
+from hilbo.report.study.report import write_study
 from hilbo.search.candidates import search_points
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import people, simulate_study, to_table, truth_table
 from hilbo.simulation.validation_sessions import sets_table, validation_table
-from hilbo.study.aggregate import aggregate_cohort
+from hilbo.study.analysis.tolerance import best_mid_worst
 from hilbo.study.cohort import cohort_of
+from hilbo.study.estimate.aggregate import aggregate_cohort
 from hilbo.study.folder import read_folder
-from hilbo.study.map_summary import best_mid_worst
-from hilbo.study.trial_table import read_trials, write_trials
+from hilbo.study.tables.trials import read_trials, write_trials
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from hilbo.study import study_schema
-from hilbo.study.protocols import PhaseTable
-from hilbo.study.study_file import checked
+from hilbo.study.file import schema
+from hilbo.study.file.protocols import PhaseTable
+from hilbo.study.file.reading import checked
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -140,9 +140,9 @@ def test_pictures_of_the_readme_are_shown_on_its_page():
 
 def schemas():
     """The tables of a study file by the heading of the page that describes them."""
-    tables = {f"[{name}]": kind for name, kind in study_schema.TABLES.items()}
-    own = {"[renderer]": study_schema.RendererTable, "[parameters.NAME]": study_schema.ParameterTable}
-    own["[parameters.NAME] of levels"] = study_schema.LevelsTable
+    tables = {f"[{name}]": kind for name, kind in schema.TABLES.items()}
+    own = {"[renderer]": schema.RendererTable, "[parameters.NAME]": schema.ParameterTable}
+    own["[parameters.NAME] of levels"] = schema.LevelsTable
     return tables | own | {"[session.PHASE]": PhaseTable}
 
 

@@ -20,8 +20,9 @@ API = {
     "inference": ("Inference and hyperparameters", "laplace gaussian inference.exact hyperparameters.maximum_evidence"),
     "aggregation": (
         "Aggregation",
-        "bcm study.cohort study.aggregate study.optima study.map_summary study.rule_comparison population.pointwise"
-        " population.hierarchical population.learnt population.response_quality",
+        "bcm study.cohort study.estimate.aggregate study.estimate.optimum study.analysis.tolerance"
+        " study.analysis.rule_comparison population.pointwise population.shared.hierarchical population.learnt.rule"
+        " population.judged.response_quality",
     ),
     "mechanics": (
         "Mechanics and search space",
@@ -31,13 +32,14 @@ API = {
     "identification": (
         "Identification",
         "identification.material_tables identification.sampled identification.fitting identification.intervals"
-        " identification.residual_noise identification.instrument identification.misfit identification.friction_laws"
-        " identification.moduli identification.characterise report.material",
+        " identification.residual_noise identification.instrument identification.misfit"
+        " identification.motor.friction_laws identification.moduli identification.characterise report.material",
     ),
     "sessions": (
         "Studies and sessions",
-        "study.config session.ask_tell session.logged_session session.headers session.plan session.actions"
-        " session.state session.event_log session.look_ahead session.views session.warm_start",
+        "study.config session.choose.ask_tell session.choose.logged_session session.log.header session.plan.plan"
+        " session.log.actions session.log.state session.log.event_log session.choose.look_ahead"
+        " app.pages.session_views session.choose.warm_start",
     ),
     "simulation": (
         "Simulation",
@@ -45,10 +47,13 @@ API = {
     ),
     "reports": (
         "Tables, statistics, reports",
-        "study.trial_table study.folder study.validation_table statistics.paper_tables statistics.logits"
-        " statistics.preferences report.comparison report.study report.result_tables",
+        "study.tables.trials study.folder study.tables.validation statistics.paper_tables statistics.logits"
+        " statistics.preferences report.study.comparison report.study.report report.study.result_tables",
     ),
-    "device": ("Device", "hardware_bridge device.protocol device.ports device.simulator device.library device.motor"),
+    "device": (
+        "Device",
+        "hardware_bridge device.protocol device.ports device.local.simulator device.local.library device.local.motor",
+    ),
 }
 ELSEWHERE = {
     "README.md": "readme.md",

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.study.config import Study
-from hilbo.study.study_file import checked
-from hilbo.study.trial_table import read_trials
+from hilbo.study.file.reading import checked
+from hilbo.study.tables.trials import read_trials
 
 PAGE = Path(__file__).parents[1] / "guides" / "mistakes.md"
 STUDY = """\

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.cli.console import Force, Json, Out, finish, progress, remark, results, seed_option, start
+from hilbo.cli.terminal.console import Force, Json, Out, finish, progress, remark, results, seed_option, start
 from hilbo.errors import InputError
 from hilbo.report.figures.painter import begin_painter
 
@@ -65,8 +65,8 @@ def aggregate(
     if not distributed:
         begin_painter()
     start(devices)
-    from hilbo.study.distributed import crew, digest
-    from hilbo.study.learnt_study import by_rule
+    from hilbo.study.estimate.distributed import crew, digest
+    from hilbo.study.estimate.learnt import by_rule
 
     with crew(distributed, coordinator, processes, process_id) as team, contextlib.ExitStack() as held:
         say = held.enter_context(progress(quiet=not team.writes))
@@ -109,7 +109,7 @@ def robustness(
         chosen, everybody, flagged = read_cohort(trials, study, material, say)
         cohort, left_out = _included(chosen, everybody)
         from hilbo.report.robustness import write_robustness
-        from hilbo.study.robustness import robustness as check
+        from hilbo.study.analysis.robustness import robustness as check
 
         say("hyperparameters by maximum evidence")
         comparison = check(chosen, cohort, seed, learn=tuple(name.strip() for name in learn.split(",")), shared=not own)
@@ -125,14 +125,14 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
     start()
     from hilbo.study.cohort import cohort_of
     from hilbo.study.config import Study
-    from hilbo.study.flag_counts import flag_sentences_of
-    from hilbo.study.trial_table import read_trials
+    from hilbo.study.tables.flag_counts import flag_sentences_of
+    from hilbo.study.tables.trials import read_trials
 
     whole = Study.load(study)
     material = material or _only_material(trials, whole)
     chosen = whole.material(material) if material and whole.materials else whole
     if trials.is_dir():
-        from hilbo.session.export import read_log_trials
+        from hilbo.session.export.tables import read_log_trials
 
         table = read_log_trials(trials, whole, material, others=False, note=remark)
     else:
@@ -144,8 +144,8 @@ def _only_material(trials: Path, study: Any) -> str | None:
     """The material that a table or the logs are of, where the study has several; None where they name none."""
     if not study.materials:
         return None
-    from hilbo.session.export import read_sessions, trials_table
-    from hilbo.study.cells import read_cells
+    from hilbo.session.export.tables import read_sessions, trials_table
+    from hilbo.study.formats.csv_file import read_cells
 
     table = trials_table(read_sessions(trials, study)) if trials.is_dir() else read_cells(trials)
     named = list(dict.fromkeys(table["material"])) if "material" in table else []
@@ -191,7 +191,7 @@ def aggregate_cohort(
     study, cohort, folder, seed, say, truth=None, compare=False, selection="", left_out=()
 ) -> dict[str, Any]:
     """The results folder of one cohort; with `compare` every rule beside, each person left out in turn."""
-    from hilbo.study.cohort_results import analyse_cohort
+    from hilbo.study.analysis.cohort_results import analyse_cohort
 
     with ThreadPoolExecutor(1) as other_core:
 
@@ -204,7 +204,7 @@ def aggregate_cohort(
 
     beside: dict[str, Any] = {}
     if compare:
-        from hilbo.report.comparison import write_comparison
+        from hilbo.report.study.comparison import write_comparison
 
         say("every rule, with each person left out")
         compared = write_comparison(study, population.aggregate, folder, seed)
@@ -215,7 +215,7 @@ def aggregate_cohort(
 def _aggregate_population(study, cohort, team, folder, seed, individuals, say, left_out=()) -> dict[str, Any]:
     """As `aggregate_cohort` for a large cohort or several devices: by the whole crew, of which one process writes."""
     from hilbo.report.large_population import population_map, write_population
-    from hilbo.study.batch_optimum import aggregate_population
+    from hilbo.study.estimate.batch_optimum import aggregate_population
 
     large = aggregate_population(study, cohort, team, seed, individuals=individuals, say=say)
     grid = population_map(study, large)

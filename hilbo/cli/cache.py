@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from hilbo.cli.console import JsonToo, cache_folder, print_result, remark
+from hilbo.cli.terminal.console import JsonToo, cache_folder, print_result, remark
 from hilbo.programs.entries import Entries
 
 __all__ = ["cache"]

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hilbo.cli.aggregate import aggregate_cohort, read_cohort
-from hilbo.cli.console import PARTS, Force, Out, progress, results, seed_option
 from hilbo.cli.study import simulated_report
+from hilbo.cli.terminal.console import PARTS, Force, Out, progress, results, seed_option
 
 __all__ = ["demo"]
 
@@ -35,7 +35,7 @@ def _print_demo(real: dict[str, Any], simulated: dict[str, Any], out: Path) -> N
     from rich.console import Console
     from rich.table import Table as RichTable
 
-    from hilbo.population.recipes import RECOMMENDED
+    from hilbo.population.learnt.recipes import RECOMMENDED
 
     console = Console(highlight=False, soft_wrap=True)
     best = real["optimum"]["parameters"]

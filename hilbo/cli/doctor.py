@@ -134,7 +134,7 @@ def _serial_ports() -> Check:
 
 
 def _study_file(path: Path) -> tuple[Check, Any]:
-    from hilbo.study.study_file import StudyFile
+    from hilbo.study.file.reading import StudyFile
 
     try:
         file = StudyFile.load(path)
@@ -209,7 +209,7 @@ def _step(study: Any) -> Check:
     steps = min(study.selection.space_filling + 1, study.selection.trials - 1)
     if not steps:
         return Check("time of a step", "good", "none to measure: a session has one trial")
-    from hilbo.session.ask_tell import Session
+    from hilbo.session.choose.ask_tell import Session
 
     session, took = Session.start(study, seed=0), 0.0
     session.warm().join()
@@ -243,7 +243,7 @@ def _device(connect: Callable[[float | None, float | None], Any], file: Any) -> 
 
 def _language(file: Any) -> Iterator[Check]:
     """Whether participants can read all of it, and whether somebody has read it before them."""
-    from hilbo.study.languages import LANGUAGES, language
+    from hilbo.study.file.languages import LANGUAGES, language
 
     session = file.session
     if session.language == "en":
@@ -285,9 +285,9 @@ def _stimulus(file: Any) -> Iterator[Check]:
 def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator[Check]:
     """Have the program join, present and stop; it is given a link on stderr. Raises `InputError` where a device
     renders."""
-    from hilbo.app import serve
-    from hilbo.app.stimulus_check import StimulusCheck
-    from hilbo.study.study_file import StudyFile
+    from hilbo.app.rigs.stimulus_check import StimulusCheck
+    from hilbo.app.server import serve
+    from hilbo.study.file.reading import StudyFile
 
     study = StudyFile.load(path)
     if study.stimulus is not None and study.stimulus.by == "person":

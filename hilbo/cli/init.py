@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from hilbo.cli.new_file import check_free, new_file
+from hilbo.cli.terminal.new_file import check_free, new_file
 from hilbo.errors import InputError
 
 __all__ = ["init"]
@@ -41,7 +41,7 @@ def init(
 ) -> None:
     """Write a commented study file, from a few words about the study."""
     check_free(study, force)
-    from hilbo.study.new_study import NewStudy, parameter_of, study_text
+    from hilbo.study.template import NewStudy, parameter_of, study_text
 
     parameters = tuple(parameter_of(text) for text in parameter or [])
     if by not in ("program", "person"):

@@ -14,8 +14,8 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from hilbo.cli.console import JsonToo, check_choice, progress, seed_option, start
-from hilbo.cli.device_options import Baud, Sim, Where, sim_options, takes
+from hilbo.cli.device.options import Baud, Sim, Where, sim_options, takes
+from hilbo.cli.terminal.console import JsonToo, check_choice, progress, seed_option, start
 from hilbo.errors import InputError
 
 __all__ = ["doctor", "live", "need_extra", "session"]
@@ -80,7 +80,7 @@ def session(
 ) -> None:
     """A live session: the participant's and the experimenter's page, what shows renderings, and the log."""
     need_extra()
-    from hilbo.app import serve
+    from hilbo.app.server import serve
 
     with contextlib.ExitStack() as held:
         _claim(served.logs, participant, name)
@@ -89,8 +89,8 @@ def session(
         with progress() as say:
             say("loading")
             start()
-            from hilbo.app.opening import Wanted, let_go, opened
-            from hilbo.session.event_log import keys_path
+            from hilbo.app.hub.opening import Wanted, let_go, opened
+            from hilbo.session.log.event_log import keys_path
 
             wanted = Wanted(
                 study, participant, name, seed, served.logs, plan, material, resume, people, warm_start, dry_run
@@ -105,7 +105,7 @@ def session(
 
 
 def _serve(hub, place, served, as_json) -> None:
-    from hilbo.app import serve
+    from hilbo.app.server import serve
 
     def invite(role):
         link = place.link(role)
@@ -117,7 +117,7 @@ def _serve(hub, place, served, as_json) -> None:
 
 def _started(hub, place, served, as_json) -> None:
     """Links on the terminal; with --json in one line on stdout, for programs."""
-    from hilbo.app import serve
+    from hilbo.app.server import serve
 
     stimulus = hub.state.study.stimulus
     presents = () if stimulus is None else (stimulus.role,)
@@ -145,8 +145,8 @@ def _started(hub, place, served, as_json) -> None:
 
 def _claim(logs: Path, participant: str, name: str | None) -> None:
     """The folder of the logs, made; words that no session can be called by are refused before."""
-    from hilbo.session.header_check import check_label
-    from hilbo.study.text_cells import check_id, check_text
+    from hilbo.session.log.header_check import check_label
+    from hilbo.study.formats.cell_text import check_id, check_text
 
     check_id(participant, "--participant")
     if name is not None:
@@ -207,9 +207,9 @@ def live(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: exists already; choose another --out.")
     start()
-    from hilbo.app.rehearsal import rehearse
-    from hilbo.app.robot import find_browser
-    from hilbo.study.protocols import PHASES
+    from hilbo.app.rehearsal.rehearsal import rehearse
+    from hilbo.app.rehearsal.robot import find_browser
+    from hilbo.study.file.protocols import PHASES
 
     check_choice("kind", phase, PHASES[1:])
     if find_browser() is None:

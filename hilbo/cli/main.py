@@ -10,17 +10,18 @@ from typing import Annotated
 
 import typer
 
-from hilbo.cli import device, session
 from hilbo.cli import live as cli_live
 from hilbo.cli import material as cli_material
+from hilbo.cli import session
 from hilbo.cli import study as cli_study
 from hilbo.cli import tried as cli_tried
 from hilbo.cli.aggregate import aggregate, robustness
 from hilbo.cli.cache import cache
-from hilbo.cli.console import fail, say_remarks
 from hilbo.cli.demo import demo
+from hilbo.cli.device import commands as device
 from hilbo.cli.init import init
 from hilbo.cli.simulate import simulate
+from hilbo.cli.terminal.console import fail, say_remarks
 from hilbo.errors import InputError
 
 __all__ = ["app", "main"]

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.cli.console import Force, Json, Out, check_choice, finish, progress, results, seed_option, start
+from hilbo.cli.terminal.console import Force, Json, Out, check_choice, finish, progress, results, seed_option, start
 from hilbo.errors import InputError
 
 __all__ = ["identify", "passivity"]
@@ -156,7 +156,7 @@ def _renderer(study):
     """[renderer] of a study, or the paper's."""
     if study is None:
         return {"N": 101, "T": 1e-3, "memory": "short", "K_eff": 0.44, "damping": 0.95, "delay": 0.0}
-    from hilbo.study.study_file import StudyFile
+    from hilbo.study.file.reading import StudyFile
 
     mechanics = StudyFile.load(study).space.mechanics
     if mechanics is None:

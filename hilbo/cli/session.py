@@ -10,8 +10,18 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.cli.console import Force, ForceFile, JsonToo, check_choice, progress, remark, results, seed_option, start
-from hilbo.cli.new_file import check_free, new_file
+from hilbo.cli.terminal.console import (
+    Force,
+    ForceFile,
+    JsonToo,
+    check_choice,
+    progress,
+    remark,
+    results,
+    seed_option,
+    start,
+)
+from hilbo.cli.terminal.new_file import check_free, new_file
 from hilbo.errors import InputError
 
 __all__ = ["app_participants", "export", "plan"]
@@ -44,8 +54,8 @@ def plan(
     as_json: JsonToo = False,
 ) -> None:
     """Plan a whole study in advance: orders, seeds and validation sets, with a hash that every log will hold."""
-    from hilbo.study.protocols import PHASES
-    from hilbo.study.study_file import StudyFile
+    from hilbo.study.file.protocols import PHASES
+    from hilbo.study.file.reading import StudyFile
 
     file = StudyFile.load(study)
     if register is not None:
@@ -79,11 +89,11 @@ def export(
 ) -> None:
     """Tables of a folder of session logs, as hilbo report reads them: trials, validation and sets (Psych-DS), the study
     file, and netCDF for xarray and ArviZ."""
-    from hilbo.session import export as log_tables
-    from hilbo.session.netcdf import netcdf
-    from hilbo.session.plan import check_plan, read_plan
-    from hilbo.session.psych_ds import psych_ds
-    from hilbo.study.study_file import StudyFile
+    from hilbo.session.export import tables as log_tables
+    from hilbo.session.export.netcdf import netcdf
+    from hilbo.session.export.psych_ds import psych_ds
+    from hilbo.session.plan.plan import check_plan, read_plan
+    from hilbo.study.file.reading import StudyFile
 
     chosen = StudyFile.load(study)
     if plan is not None:
@@ -113,7 +123,7 @@ def add(
     handedness: Annotated[str, typer.Option(help="right, left or both.")] = "",
 ) -> None:
     """Add somebody to the list of participants."""
-    from hilbo.session.participants import add_person
+    from hilbo.session.plan.participants import add_person
 
     row = {"participant": participant, "consent_time": consent_time, "protocol_number": protocol_number}
     add_person(table, row | {"age": age, "handedness": handedness})
@@ -126,7 +136,7 @@ def delete(
     yes: Annotated[bool, typer.Option("--yes", help="Do it; without, nothing is touched.")] = False,
 ) -> None:
     """Remove one participant who withdraws from everything below a folder, and say all that was done and left."""
-    from hilbo.session.withdrawal import Withdrawal, delete_participant
+    from hilbo.session.withdrawal.withdrawal import Withdrawal, delete_participant
 
     if not yes:
         raise InputError(f"this removes everything of participant {participant} below {folder}; add --yes to do it.")
@@ -153,7 +163,7 @@ def _say_done(done) -> None:
 def _plan_of(path, kind, source, people, materials, paths, trials, session, seed) -> dict[str, Any]:
     """The plan; `paths`: material -> result.json, of which the sets of a validation are made."""
     start()
-    from hilbo.session.plan import make_plan
+    from hilbo.session.plan.plan import make_plan
 
     with progress() as say:
         study = _searchable(path) if kind == "optimisation" else _whole(path)
@@ -182,7 +192,7 @@ def _people(count, names, letter) -> list[str]:
 def _searchable(path) -> Any:
     """The study's file, of whose parameters something can be rendered. Whoever plans an optimisation needs no model."""
     from hilbo.search.space import SearchSpace
-    from hilbo.study.study_file import StudyFile, read_study
+    from hilbo.study.file.reading import StudyFile, read_study
 
     def search_space_of(file: StudyFile) -> StudyFile:
         SearchSpace(file.space.parameters, file.space.mechanics)  # refuses a space without a passive set
@@ -210,20 +220,20 @@ def _whole(path) -> Any:
 
 def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
     """Material ("" without) -> the sets to compare."""
-    from hilbo.session import plan_sets
-    from hilbo.session.export import read_log_trials
+    from hilbo.session.export.tables import read_log_trials
+    from hilbo.session.plan import validation_sets
     from hilbo.study.cohort import cohort_of
-    from hilbo.study.result_file import read_result
-    from hilbo.study.trial_table import read_trials
+    from hilbo.study.results.result_json import read_result
+    from hilbo.study.tables.trials import read_trials
 
     sets = {}
     for material, path in paths.items():
         here = study.material(material) if material else study
         result = read_result(path, here)
         if kind == "aggregate-best":
-            sets[material] = plan_sets.aggregate_best_sets(here, result)
+            sets[material] = validation_sets.aggregate_best_sets(here, result)
             continue
-        plan_sets.check_participants(result, people, source)
+        validation_sets.check_participants(result, people, source)
         if trials is None:
             raise InputError("plan: a validation reads the map itself; give --trials, the answers it was made from.")
         say(f"the map of {material or study.name}")
@@ -231,7 +241,7 @@ def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
             table = read_log_trials(trials, study, material or None, note=remark)
         else:
             table = read_trials(trials, here, material or None)
-        sets[material] = plan_sets.validation_sets(here, result, cohort_of(table, here), source, people)
+        sets[material] = validation_sets.validation_sets(here, result, cohort_of(table, here), source, people)
     return sets
 
 
@@ -248,7 +258,7 @@ def _by_material(materials, given) -> dict[str, Path]:
 
 
 def _reissued(path, study_path, study, text, results_):
-    from hilbo.session.plan import check_plan, read_plan, reissue
+    from hilbo.session.plan.plan import check_plan, read_plan, reissue
 
     old, equals, new = text.partition("=")
     if not equals:
@@ -273,8 +283,8 @@ def _check_not_in_map(path, study_path, materials, results_, new):
             f" are made, so that {new} can be looked for there."
         )
     start()
-    from hilbo.session.plan_sets import check_participants
-    from hilbo.study.result_file import read_result
+    from hilbo.session.plan.validation_sets import check_participants
+    from hilbo.study.results.result_json import read_result
 
     study = _whole(study_path)
     for material, source in _by_material(materials, results_).items():
@@ -292,7 +302,7 @@ def _check_register(register, out, reissue, force):
 
 def _write_registration(file, plan, out):
     from hilbo import __version__
-    from hilbo.session.registration import registration
+    from hilbo.report.registration import registration
 
     with new_file(out) as path:
         path.write_text(registration(file, plan, __version__), encoding="utf-8")

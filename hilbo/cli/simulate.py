@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from hilbo.cli.aggregate import aggregate_cohort
-from hilbo.cli.console import Force, Json, Out, Preset, finish, progress, results, seed_option, start
 from hilbo.cli.live import live as hold_session
+from hilbo.cli.terminal.console import Force, Json, Out, Preset, finish, progress, results, seed_option, start
 from hilbo.errors import InputError
 
 __all__ = ["simulate"]
@@ -59,14 +59,14 @@ def _check_mode(live: bool, of_a_study: Mapping[str, Any], of_a_session: Mapping
 def _simulate(preset, source, count, seed, folder, say) -> dict[str, Any]:
     say("simulating")
     start()
-    from hilbo.session.registration import selection_words
+    from hilbo.report.registration import selection_words
     from hilbo.simulation.folder import simulate_folder
 
     simulated = simulate_folder(folder, preset, count, seed, source)
     chosen = selection_words(simulated.study.selection)
     study, truth = simulated.study, simulated.truth
     content = aggregate_cohort(study, simulated.cohort, folder, seed, say, truth, selection=chosen)
-    from hilbo.study.optimum_location import truth_sentence
+    from hilbo.study.estimate.location import truth_sentence
 
     say.tell([truth_sentence(study, truth, content["truth"]["nrmse"]["aggregate"]["nrmse"])])
     return content

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.cli.console import Force, Json, Out, Preset, finish, progress, results, seed_option, start
+from hilbo.cli.terminal.console import Force, Json, Out, Preset, finish, progress, results, seed_option, start
 from hilbo.errors import InputError
 
 __all__ = ["power", "report", "simulated_report", "validate"]
@@ -59,7 +59,7 @@ def power(
         from hilbo.simulation.power import Plan, cores, simulate_power
         from hilbo.simulation.presets import population_of
         from hilbo.study.config import Study
-        from hilbo.study.learnt_study import by_rule
+        from hilbo.study.estimate.learnt import by_rule
 
         chosen = Study.load(study)
         chosen = chosen if rule is None else by_rule(chosen, rule)
@@ -101,7 +101,7 @@ def report(
     with results(out, force) as destination, progress() as say:
         start()
         say("reading")
-        from hilbo.report.study import write_study
+        from hilbo.report.study.report import write_study
         from hilbo.study.folder import read_folder
 
         content = write_study(read_folder(folder, exclude), destination, seed, say, comparison=compare)
@@ -113,10 +113,10 @@ def simulated_report(folder: Path, seed: int, say: Callable[..., None], count: i
     its report in the same folder; returns the content of result.json."""
     import numpy as np
 
-    from hilbo.report.study import write_study
+    from hilbo.report.study.report import write_study
     from hilbo.simulation.folder import simulate_folder
     from hilbo.simulation.validation_sessions import sets_table, validation_table
-    from hilbo.study.analysis import analyse
+    from hilbo.study.analysis.analysis import analyse
     from hilbo.study.folder import read_folder
 
     say("simulating")

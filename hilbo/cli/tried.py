@@ -15,8 +15,8 @@ from typing import Annotated
 
 import typer
 
-from hilbo.cli.console import progress, seed_option, start
 from hilbo.cli.live import need_extra
+from hilbo.cli.terminal.console import progress, seed_option, start
 from hilbo.errors import InputError
 
 __all__ = ["study_text", "tried"]
@@ -38,7 +38,7 @@ def tried(
 ) -> None:
     """Take part yourself: compare soft blocks under the mouse, and see your own map. No device is needed."""
     need_extra()
-    from hilbo.app import serve
+    from hilbo.app.server import serve
 
     text = study_text(study, trials)
     if browse:
@@ -59,9 +59,9 @@ def tried(
 
 def _opened(folder, seed, say):
     """The hub of a session whose reference is hidden, its log, and what its page is told."""
-    from hilbo.app.opening import Wanted, opened
-    from hilbo.app.tried import Tried, hidden_reference
-    from hilbo.study.study_file import StudyFile
+    from hilbo.app.hub.opening import Wanted, opened
+    from hilbo.app.server.tried import Tried, hidden_reference
+    from hilbo.study.file.reading import StudyFile
 
     study = StudyFile.load(folder / "study.toml")
     reference = hidden_reference(study, seed)
@@ -80,8 +80,8 @@ def study_text(source: Path | None, trials: int | None) -> str:
         return _LINE.sub(f"trials = {_TRIALS if trials is None else trials}", text)
     if trials is not None:
         raise InputError(f"--trials: {source} says how many there are ([selection] trials); leave the option out.")
-    from hilbo.app.tried import check_study
-    from hilbo.study.study_file import StudyFile
+    from hilbo.app.server.tried import check_study
+    from hilbo.study.file.reading import StudyFile
 
     check_study(StudyFile.load(source))
     return source.read_text(encoding="utf-8-sig")

@@ -180,11 +180,11 @@ def keep_beating(line: int, boot_id: int, tick: int, signs: int, out: int, grace
         reading, writing = [signs, line], [out] if waiting else []
         ready = select.select(reading, writing, [], max(0.0, due - time.monotonic()))[0]
         if signs in ready:
-            told = _told(signs)
-            if not told:
+            came = _told(signs)
+            if not came:
                 _pass_on(out, waiting, blocking=True)
                 return
-            alive, last = time.monotonic(), told.replace(_ALIVE, b"")[-1:]
+            alive, last = time.monotonic(), came.replace(_ALIVE, b"")[-1:]
             quiet = last == _QUIET if last else quiet
         if line in ready:
             data = _arrived(line)

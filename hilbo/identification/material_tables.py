@@ -20,8 +20,8 @@ from jaxtyping import Float
 
 from hilbo.errors import InputError
 from hilbo.identification.fitting import Test
-from hilbo.study.cells import numbers, place, read_cells, refuse
-from hilbo.study.trial_table import of_material
+from hilbo.study.formats.csv_file import numbers, place, read_cells, refuse
+from hilbo.study.tables.trials import of_material
 
 __all__ = ["Material", "read_material"]
 

@@ -28,12 +28,12 @@ from hilbo.numerics.shown import known
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
-from hilbo.population.counts import Counts, counts_of, fit_counts, one_person
-from hilbo.population.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
-from hilbo.population.learnt import Learnt, learnt_function
+from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.learnt.rule import Learnt, learnt_function
 from hilbo.population.newcomer import class_probabilities
-from hilbo.population.recipes import RECIPES
-from hilbo.population.shared_posterior import ContextEffects
+from hilbo.population.shared.counts import Counts, counts_of, fit_counts, one_person
+from hilbo.population.shared.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
+from hilbo.population.shared.posterior import ContextEffects
 
 __all__ = [
     "ALL_RULES",

@@ -15,7 +15,7 @@ cov(g) = p k, cov(h_j) = (1 - p) k, point by point: of e_j's precision only a pa
 h_j is noise to it. p = 1 is the Bayesian committee machine, which says that people do not differ. `average` is the
 plain mean of the latents, in which everybody counts the same.
 
-The sums may be made at once (`aggregate`), or of blocks of people that are added up (`hilbo.study.batch`).
+The sums may be made at once (`aggregate`), or of blocks of people that are added up (`hilbo.study.estimate.batch`).
 References: Tresp (2000) bcm; Deisenroth & Ng (2015) rbcm. Products of experts and grbcm were measured beside these and
 won nowhere (docs/methods/aggregation.md).
 """

@@ -15,11 +15,11 @@ from scipy.interpolate import RegularGridInterpolator
 from hilbo.report.page import results_page
 from hilbo.report.participants import json_lines, people_of
 from hilbo.report.results import optima_table, result, save_figures
-from hilbo.study.batch_optimum import LargeAggregate
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.map_file import map_dataset, on_grid, write_map
-from hilbo.study.typed_files import sealed
+from hilbo.study.estimate.batch_optimum import LargeAggregate
+from hilbo.study.formats.json_file import sealed
+from hilbo.study.results.map_netcdf import map_dataset, on_grid, write_map
 
 __all__ = ["population_map", "write_population"]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from hilbo.population.recipes import RECIPES
+from hilbo.population.learnt.recipes import RECIPES
 from hilbo.report.kernel_words import covariance_words, formula
 from hilbo.report.participants import People
 from hilbo.study.config import Study

@@ -23,19 +23,19 @@ from hilbo.report.page import Pictures, results_page
 from hilbo.report.participants import People, as_json, json_lines, people_of
 from hilbo.search.apart import differences, nrmse
 from hilbo.search.rendering import K0_range, margin_of, set_of
-from hilbo.study.aggregate import Aggregate, asked_variance, other_inference
-from hilbo.study.batch_optimum import LargeAggregate
-from hilbo.study.cohort_results import CohortResults
+from hilbo.study.analysis.cohort_results import CohortResults
+from hilbo.study.analysis.effects import effects_of
+from hilbo.study.analysis.heterogeneity import heterogeneity, in_place, rule_warnings
+from hilbo.study.analysis.model_check import check_sentences, model_check
+from hilbo.study.analysis.region import optimum_region, region_content, region_sentences
 from hilbo.study.config import Study
-from hilbo.study.effects import effects_of
-from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
-from hilbo.study.learnt_study import effect_content, learnt_content, learnt_sentences
-from hilbo.study.map_file import map_dataset, on_grid, write_map
-from hilbo.study.model_check import check_sentences, model_check
-from hilbo.study.optima import Optimum
-from hilbo.study.optimum_location import location_notes, location_sentences
-from hilbo.study.optimum_region import optimum_region, region_content, region_sentences
-from hilbo.study.typed_files import sealed
+from hilbo.study.estimate.aggregate import Aggregate, asked_variance, other_inference
+from hilbo.study.estimate.batch_optimum import LargeAggregate
+from hilbo.study.estimate.learnt import effect_content, learnt_content, learnt_sentences
+from hilbo.study.estimate.location import location_notes, location_sentences
+from hilbo.study.estimate.optimum import Optimum
+from hilbo.study.formats.json_file import sealed
+from hilbo.study.results.map_netcdf import map_dataset, on_grid, write_map
 
 __all__ = [
     "as_json",

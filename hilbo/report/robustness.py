@@ -11,10 +11,10 @@ import xarray as xr
 from hilbo.hyperparameters.judged_evidence import judged_sentences
 from hilbo.report.page import Pictures, rendered
 from hilbo.report.results import as_json, optimum_content, save_figures, versions
+from hilbo.study.analysis.robustness import LIMIT, Robustness
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.map_file import map_dataset
-from hilbo.study.robustness import LIMIT, Robustness
+from hilbo.study.results.map_netcdf import map_dataset
 
 __all__ = ["robustness_page", "robustness_result", "write_robustness"]
 

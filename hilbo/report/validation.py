@@ -21,10 +21,10 @@ from hilbo.report.results import as_json, save_figures, versions
 from hilbo.statistics.paper_tables import PaperTables, aggregate_comparisons, paper_tables, set_sources
 from hilbo.statistics.preferences import rate
 from hilbo.statistics.regression import Regression
-from hilbo.study.cells import read_cells
 from hilbo.study.config import Study
-from hilbo.study.flag_counts import flag_sentences_of
-from hilbo.study.validation_table import RESPONSES, TIE, check_validation, of_material, read_validation, sets_frame
+from hilbo.study.formats.csv_file import read_cells
+from hilbo.study.tables.flag_counts import flag_sentences_of
+from hilbo.study.tables.validation import RESPONSES, TIE, check_validation, of_material, read_validation, sets_frame
 
 __all__ = [
     "Validated",

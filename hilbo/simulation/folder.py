@@ -13,7 +13,7 @@ from hilbo.simulation.presets import placed, population_of
 from hilbo.simulation.simulate import Population
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
-from hilbo.study.trial_table import write_trials
+from hilbo.study.tables.trials import write_trials
 
 __all__ = ["Simulated", "simulate_folder"]
 

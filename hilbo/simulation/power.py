@@ -30,17 +30,17 @@ from scipy.stats import binomtest
 
 from hilbo.errors import InputError
 from hilbo.numerics.tracing import program
+from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map
-from hilbo.population.recipes import RECIPES
 from hilbo.search.apart import differences
 from hilbo.search.candidates import search_points
 from hilbo.simulation.presets import placed
 from hilbo.simulation.simulate import Person, Population, felt_apart, people, simulate_study
-from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.learnt_study import by_rule, resolved
-from hilbo.study.optima import map_optimum
+from hilbo.study.estimate.aggregate import fit_cohort
+from hilbo.study.estimate.learnt import by_rule, resolved
+from hilbo.study.estimate.optimum import map_optimum
 
 __all__ = ["Plan", "cores", "one_study", "power_table", "simulate_power", "summarise", "top_probability"]
 

@@ -14,7 +14,7 @@ import numpy as np
 from hilbo.errors import InputError
 from hilbo.simulation.simulate import Population
 from hilbo.study.config import Study
-from hilbo.study.simulation_table import SimulationTable, each
+from hilbo.study.file.simulated_people import SimulationTable, each
 
 __all__ = ["PRESETS", "placed", "population_of", "preset_of"]
 

@@ -24,7 +24,7 @@ from hilbo.errors import InputError
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
 from hilbo.search.apart import differences, levels_of
-from hilbo.session.selection import Design, design, next_point
+from hilbo.session.choose.selection import Design, design, next_point
 from hilbo.study.config import Study
 
 __all__ = ["Person", "Population", "felt_apart", "people", "simulate_study", "to_table", "truth_table"]

@@ -14,10 +14,10 @@ import pandas as pd
 from jaxtyping import Float
 
 from hilbo.search.rendering import set_of
-from hilbo.session.set_codes import OWN, code_of
+from hilbo.session.plan.set_codes import OWN, code_of
 from hilbo.simulation.simulate import Person, Population, felt_apart, people
+from hilbo.study.analysis.tolerance import Sets
 from hilbo.study.config import Study
-from hilbo.study.map_summary import Sets
 
 __all__ = ["sets_table", "validation_table"]
 

@@ -19,8 +19,8 @@ from hilbo.statistics.columns import check_level
 from hilbo.statistics.logits import binary_logit, ordered_logit, tied_preferences
 from hilbo.statistics.preferences import classifications, confusion, preference_rates
 from hilbo.statistics.regression import Regression
-from hilbo.study.set_table import ROLES, role_of, source_kind
-from hilbo.study.validation_table import NONE, RESPONSES, TIE, check_validation, of_material
+from hilbo.study.tables.parameter_sets import ROLES, role_of, source_kind
+from hilbo.study.tables.validation import NONE, RESPONSES, TIE, check_validation, of_material
 
 __all__ = ["PaperTables", "aggregate_comparisons", "paper_tables", "set_sources"]
 
@@ -51,7 +51,7 @@ def paper_tables(
 ) -> PaperTables:
     """Every statistic of the paper's validation sessions, of one material.
 
-    `sets` is a sets table (`validation_table.sets_frame`); its column `role`, if it has one, says which sets are best,
+    `sets` is a sets table (`tables.validation.sets_frame`); its column `role`, if it has one, says which sets are best,
     mid and worst. Without it the names say so, as plans give them: "best", "foam best", "foam P07 best"; and in table
     IV "aggregate" and "individual:PARTICIPANT", with or without a material before. Raises `InputError` for a bad table.
     """

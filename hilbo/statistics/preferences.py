@@ -17,7 +17,7 @@ from hilbo.errors import InputError
 from hilbo.statistics.columns import check_level, is_yes_or_no, labels_of
 from hilbo.statistics.logits import binary_logit
 from hilbo.statistics.regression import Clusters
-from hilbo.study.validation_table import NONE, RESPONSES, TIE
+from hilbo.study.tables.validation import NONE, RESPONSES, TIE
 
 __all__ = ["classifications", "confusion", "preference_rates", "rate"]
 

@@ -17,10 +17,10 @@ from hilbo.numerics.rows import rows_of
 from hilbo.numerics.shown import known
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
-from hilbo.population.recipes import RECIPES
+from hilbo.population.learnt.recipes import RECIPES
 from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
-from hilbo.study.trial_table import checked_trials, is_checked
+from hilbo.study.tables.trials import checked_trials, is_checked
 
 __all__ = ["Cohort", "cohort_of"]
 
@@ -87,9 +87,9 @@ class Cohort(eqx.Module):
 
 
 def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:
-    """Participants from a trial table: one that `trial_table.read_trials` made, whose rows stay in their order, that of
-    the answers; or a DataFrame of yours with the same columns, which is checked and put in order as a file is. So is
-    one that `read_trials` made and you changed.
+    """Participants from a trial table: one that `tables.trials.read_trials` made, whose rows stay in their order, that
+    of the answers; or a DataFrame of yours with the same columns, which is checked and put in order as a file is. So
+    is one that `read_trials` made and you changed.
 
     `capacity` defaults to the study's number of trials, or to the most answers of a participant if that is more.
     Raises `InputError` for a table that is none of the study's, and a `capacity` that somebody's answers exceed.

@@ -9,16 +9,16 @@ import equinox as eqx
 from hilbo.errors import InputError
 from hilbo.kernels import Levels
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
-from hilbo.population.learnt import Learnt
-from hilbo.population.learnt_posterior import NOTHING, Stated, every_theta, prior_model
+from hilbo.population.learnt.posterior import NOTHING, Stated, every_theta, prior_model
+from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.learnt.rule import Learnt
 from hilbo.population.maps import AnyRule
-from hilbo.population.recipes import RECIPES
 from hilbo.search.space import SearchSpace
-from hilbo.study.protocols import SessionTable
-from hilbo.study.simulation_table import SimulationTable
-from hilbo.study.stimulus_table import StimulusTable
-from hilbo.study.study_file import StudyFile, checked, hash_of, made_of_material, materials_in, read_study
-from hilbo.study.study_schema import Inference, ReportTable, Selection
+from hilbo.study.file.protocols import SessionTable
+from hilbo.study.file.reading import StudyFile, checked, hash_of, made_of_material, materials_in, read_study
+from hilbo.study.file.schema import Inference, ReportTable, Selection
+from hilbo.study.file.simulated_people import SimulationTable
+from hilbo.study.file.stimuli import StimulusTable
 
 __all__ = ["RBF", "OrdinalGP", "OrdinalProbit", "Study"]
 
@@ -37,9 +37,9 @@ class Study(eqx.Module):
     attribute: str = eqx.field(static=True)
     """What is judged, in words: labels of axes."""
     exclude: str = eqx.field(static=True)
-    """The rule by which people are left out (`hilbo.population.response_quality`), empty for nobody."""
+    """The rule by which people are left out (`hilbo.population.judged.response_quality`), empty for nobody."""
     exclude_flags: tuple[str, ...] = eqx.field(static=True)
-    """Flags of the device for which an analysis leaves a trial out (`hilbo.study.trial_flags`)."""
+    """Flags of the device for which an analysis leaves a trial out (`hilbo.study.file.trial_flags`)."""
     selection: Selection = eqx.field(static=True)
     inference: Inference = eqx.field(static=True)
     rule: AnyRule = eqx.field(static=True)

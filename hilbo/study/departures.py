@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
-from hilbo.study.typed_files import decoded, read_bytes
+from hilbo.study.formats.json_file import decoded, read_bytes
 
 __all__ = ["PHASE", "Held", "departures"]
 

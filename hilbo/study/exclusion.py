@@ -5,7 +5,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from hilbo.errors import InputError
-from hilbo.population.response_quality import excluded, measure_people
+from hilbo.population.judged.response_quality import excluded, measure_people
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 

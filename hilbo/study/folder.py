@@ -22,14 +22,14 @@ import pandas as pd
 from jaxtyping import Float
 
 from hilbo.errors import InputError, warn_caller
-from hilbo.study.cells import numbers, parameter_values, read_cells
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.departures import PHASE, Held, departures
-from hilbo.study.flag_counts import flag_counts, with_flag_counts
-from hilbo.study.trial_flags import FlagCounts, flag_sentences
-from hilbo.study.trial_table import NothingToFitError, check_texts, marked, ordered, read_trials
-from hilbo.study.validation_table import check_validation, sets_frame
+from hilbo.study.file.trial_flags import FlagCounts, flag_sentences
+from hilbo.study.formats.csv_file import numbers, parameter_values, read_cells
+from hilbo.study.tables.flag_counts import flag_counts, with_flag_counts
+from hilbo.study.tables.trials import NothingToFitError, check_texts, marked, ordered, read_trials
+from hilbo.study.tables.validation import check_validation, sets_frame
 
 __all__ = ["Material", "StudyFolder", "read_folder"]
 

@@ -8,13 +8,13 @@ import time
 import pytest
 from live_server import DATA, PATIENCE, Live
 
-from hilbo.app import rehearsal
-from hilbo.app.robot import Client, Participant, browser, find_browser, held
-from hilbo.app.slices import Maps
-from hilbo.session.event_log import EventLog, read_log
-from hilbo.session.records import Block, Planned
+from hilbo.app.pages.slices import Maps
+from hilbo.app.rehearsal import rehearsal
+from hilbo.app.rehearsal.robot import Client, Participant, browser, find_browser, held
+from hilbo.session.log.event_log import EventLog, read_log
+from hilbo.session.log.records import Block, Planned
 from hilbo.study.config import Study
-from hilbo.study.new_study import NewStudy, parameter_of, study_text
+from hilbo.study.template import NewStudy, parameter_of, study_text
 
 pytestmark = [
     pytest.mark.deep,

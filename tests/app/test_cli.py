@@ -14,25 +14,25 @@ from commands import run
 from live_server import DATA, study_of
 from msgspec import structs, to_builtins
 
-from hilbo.app import serve
-from hilbo.app.opening import Wanted, opened
-from hilbo.app.rehearsal import example_sets, fast_study, rehearse
+from hilbo.app.hub.opening import Wanted, opened
+from hilbo.app.rehearsal.rehearsal import example_sets, fast_study, rehearse
+from hilbo.app.server import serve
 from hilbo.cli import doctor
 from hilbo.cli.main import app
-from hilbo.device.simulator import Simulator
+from hilbo.device.local.simulator import Simulator
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import Renderer
-from hilbo.session import actions
-from hilbo.session.event_log import read_log
-from hilbo.session.headers import header_for
-from hilbo.session.participants import add_person
-from hilbo.session.plan import make_plan, plan_hash, reissue
-from hilbo.session.warm_start import read_warm_start
-from hilbo.session.withdrawal import delete_participant
+from hilbo.session.choose.warm_start import read_warm_start
+from hilbo.session.log import actions
+from hilbo.session.log.event_log import read_log
+from hilbo.session.log.header import header_for
+from hilbo.session.plan.participants import add_person
+from hilbo.session.plan.plan import make_plan, plan_hash, reissue
+from hilbo.session.withdrawal.withdrawal import delete_participant
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
-from hilbo.study.new_study import NewStudy, parameter_of, study_text
-from hilbo.study.protocols import protocol
+from hilbo.study.file.protocols import protocol
+from hilbo.study.template import NewStudy, parameter_of, study_text
 
 PERSON = {"participant": "P01", "consent_time": "2026-03-02T10:00", "protocol_number": "7", "age": "", "handedness": ""}
 
@@ -87,7 +87,7 @@ def test_a_rehearsal_asks_for_a_session_that_can_begin(tmp_path, monkeypatch, ph
     def asked(study, arguments, decide):
         raise RuntimeError(*arguments)
 
-    monkeypatch.setattr("hilbo.app.rehearsal._by_stand_in", asked)
+    monkeypatch.setattr("hilbo.app.rehearsal.rehearsal._by_stand_in", asked)
     with pytest.raises(RuntimeError) as caught:
         rehearse(tmp_path / "base.toml", tmp_path / "out", phase=phase, seed=3)
     served(monkeypatch, *caught.value.args)

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import pytest
 from bare_server import Bare, connected, request, status, until_closed, until_words
 
-from hilbo.app.serve import _Admission
-from hilbo.app.turns import Turns
+from hilbo.app.server.round_robin import Turns
+from hilbo.app.server.serve import _Admission
 
 HALF = b"GET / HTTP/1.1\r\nHost: "
 
@@ -27,8 +27,8 @@ def server(tmp_path_factory):
 @pytest.fixture
 def brief(monkeypatch):
     """Patience of a tenth of a second."""
-    for module in ("connections", "porter"):
-        monkeypatch.setattr(f"hilbo.app.{module}.PATIENCE", 0.1)
+    for module in ("connections", "admission"):
+        monkeypatch.setattr(f"hilbo.app.server.{module}.PATIENCE", 0.1)
 
 
 def patient(line, seconds=4.0):
@@ -72,7 +72,7 @@ def test_a_message_that_is_too_large_is_told_so(server):
 
 
 def test_the_oldest_stranger_is_given_up_and_nobody_with_a_key(server, monkeypatch):
-    monkeypatch.setattr("hilbo.app.turns._APART", 0.0005)  # s: a stranger's turn comes sooner
+    monkeypatch.setattr("hilbo.app.server.round_robin._APART", 0.0005)  # s: a stranger's turn comes sooner
     with connected(server.port) as mine:
         assert status(server.stops(mine)) == 200
         strangers = [connected(server.port) for _ in range(900)]

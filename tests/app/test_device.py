@@ -9,12 +9,12 @@ import time
 import pytest
 from live_server import Live, refused, until_held
 
-from hilbo.app import runner
-from hilbo.app.device_rig import DeviceRig
-from hilbo.app.rehearsal import _let_go
-from hilbo.device.simulator import Simulator
+from hilbo.app.hub import runner
+from hilbo.app.rehearsal.rehearsal import _let_go
+from hilbo.app.rigs.device_rig import DeviceRig
+from hilbo.device.local.simulator import Simulator
 from hilbo.hardware_bridge import DeviceError, Renderer, State
-from hilbo.study.study_file import StudyFile
+from hilbo.study.file.reading import StudyFile
 
 PAPER = "hilbo/data/paper.toml"
 

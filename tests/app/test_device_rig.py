@@ -10,13 +10,13 @@ from fake_device import FakeDevice
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilbo.app import device_rig
-from hilbo.app.device_rig import DeviceRig
-from hilbo.app.rig import Showing
+from hilbo.app.rigs import device_rig
+from hilbo.app.rigs.device_rig import DeviceRig
+from hilbo.app.rigs.rig import Showing
 from hilbo.device.reasons import DeviceFlag, HoldReason, SampleFlag, State
 from hilbo.hardware_bridge import DeviceError
-from hilbo.study.study_file import StudyFile
-from hilbo.study.trial_flags import FLAGS
+from hilbo.study.file.reading import StudyFile
+from hilbo.study.file.trial_flags import FLAGS
 
 STUDY = StudyFile.load("hilbo/data/paper.toml")
 VALUES = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}

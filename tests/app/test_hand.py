@@ -5,10 +5,10 @@ import pytest
 from fake_device import FakeDevice
 from live_server import Live
 
-from hilbo.app import runner
+from hilbo.app.hub import runner
 from hilbo.device.reasons import HoldReason, SampleFlag, State
-from hilbo.session.export import trials_table
-from hilbo.session.records import Block, Planned
+from hilbo.session.export.tables import trials_table
+from hilbo.session.log.records import Block, Planned
 
 WARM_UP = (Block("warm-up", 4, tuple(map(Planned, ("best", "mid", "worst", "best")))),)
 

@@ -11,9 +11,9 @@ import urllib.request
 import pytest
 from live_server import PATIENCE, Live, ask, refused
 
-from hilbo.app import watchers
-from hilbo.app.robot import Client
-from hilbo.session.records import Block, Planned
+from hilbo.app.rehearsal.robot import Client
+from hilbo.app.wire import watchers
+from hilbo.session.log.records import Block, Planned
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def test_a_link_opened_on_a_full_disk_can_be_opened_again(live):
 
 def test_a_sleeping_laptop_begins_the_trial_again(tmp_path, monkeypatch):
     with Live(tmp_path, seconds=60.0) as live:  # it sleeps in the first step
-        import hilbo.app.interruptions as module
+        import hilbo.app.hub.interruptions as module
 
         live.begin()
         live.until(lambda v: v["phase"] == "step")
@@ -104,7 +104,7 @@ def test_the_watch_goes_on_after_a_fault_and_says_so(live, monkeypatch):
         looked.append(1)
         raise RuntimeError("no such thing")
 
-    monkeypatch.setattr("hilbo.app.interruptions._LATER", 0.05)
+    monkeypatch.setattr("hilbo.app.hub.interruptions._LATER", 0.05)
     monkeypatch.setattr(interruptions, "_say", broken)
     view = live.until(lambda v: v["alert"], live.whole)
     assert "no such thing" in view["alert"] and "what interrupts the session" in view["alert"]
@@ -120,7 +120,7 @@ def test_an_interruption_that_cannot_be_told_is_said(live, monkeypatch):
         live.hub._loop.call_soon_threadsafe(live.hub._interruptions.device_changed, live.hub.rig.snapshot)
 
     with monkeypatch.context() as patched:
-        patched.setattr("hilbo.app.interruptions._condition_of", broken)
+        patched.setattr("hilbo.app.hub.interruptions._condition_of", broken)
         tell()
         assert "no such device" in live.until(lambda v: v["alert"], live.whole)["alert"]
         live.command("note", text="yawned")  # an event that is written takes back no fault

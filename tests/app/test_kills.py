@@ -13,9 +13,9 @@ import pytest
 from killed_session import PATIENCE, Session
 from live_server import DATA, until_held
 
-from hilbo.app.rehearsal import example_sets, fast_study
-from hilbo.device.simulator import Simulator
-from hilbo.session.plan import make_plan
+from hilbo.app.rehearsal.rehearsal import example_sets, fast_study
+from hilbo.device.local.simulator import Simulator
+from hilbo.session.plan.plan import make_plan
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 

@@ -10,10 +10,11 @@ from live_server import PATIENCE
 from live_stimulus import SETS, LiveStimulus
 from starlette.requests import Request
 
-from hilbo.app import messages, server
-from hilbo.app.lines import fields_of, lines_of
+from hilbo.app.server import server
+from hilbo.app.wire import messages
+from hilbo.app.wire.lines import fields_of, lines_of
 from hilbo.errors import InputError
-from hilbo.session.records import Block, Planned
+from hilbo.session.log.records import Block, Planned
 
 
 def test_a_form_is_read_as_text():

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from live import KINDS, Driver
 
-from hilbo.app.log_words import line, sentence, table
-from hilbo.session import actions as live
+from hilbo.app.pages.log_words import line, sentence, table
+from hilbo.session.log import actions as live
 
 anything = st.lists(st.tuples(st.sampled_from(KINDS), st.integers(0, 1000)), max_size=40)
 

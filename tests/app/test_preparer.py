@@ -9,16 +9,16 @@ import pytest
 from live_server import PATIENCE, check_blinding, listen, refused
 from live_stimulus import SETS, SINGLE, ByHand, LiveStimulus
 
-from hilbo.app.blind import _SAME
-from hilbo.app.opening import Wanted, _header
-from hilbo.app.robot import Client, Participant, browser, find_browser, screenshots
-from hilbo.app.slices import Maps
+from hilbo.app.hub.opening import Wanted, _header
+from hilbo.app.pages.blind import _SAME
+from hilbo.app.pages.slices import Maps
+from hilbo.app.rehearsal.robot import Client, Participant, browser, find_browser, screenshots
 from hilbo.cli import doctor
 from hilbo.errors import InputError
-from hilbo.session.event_log import EventLog, read_log
-from hilbo.session.set_codes import label_of
-from hilbo.study.new_study import NewStudy, parameter_of, study_text
-from hilbo.study.study_file import StudyFile
+from hilbo.session.log.event_log import EventLog, read_log
+from hilbo.session.plan.set_codes import label_of
+from hilbo.study.file.reading import StudyFile
+from hilbo.study.template import NewStudy, parameter_of, study_text
 
 BY_PERSON = 'by = "person"\n'
 

@@ -4,7 +4,7 @@ import stat
 
 import pytest
 
-from hilbo.app.security import Gate, lan_addresses
+from hilbo.app.wire.security import Gate, lan_addresses
 from hilbo.errors import InputError
 
 HERE = "127.0.0.1:8642"

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from live_server import Live, ask, refused
 
-from hilbo.app.commands import COMMANDS
-from hilbo.app.hub import PRESSES
+from hilbo.app.hub.commands import COMMANDS
+from hilbo.app.hub.hub import PRESSES
 
 
 @pytest.fixture(scope="module")

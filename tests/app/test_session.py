@@ -7,10 +7,10 @@ import threading
 import pytest
 from live_server import PATIENCE, Live, check_blinding, listen, refused
 
-from hilbo.app.opening import Wanted, opened
-from hilbo.app.views import choice_rows
-from hilbo.session.export import validation_table
-from hilbo.session.records import Block, Planned
+from hilbo.app.hub.opening import Wanted, opened
+from hilbo.app.pages.views import choice_rows
+from hilbo.session.export.tables import validation_table
+from hilbo.session.log.records import Block, Planned
 
 
 @pytest.fixture

@@ -6,11 +6,11 @@ from live import RAW, beginning
 from live_stimulus import SINGLE, LiveLevels
 
 from hilbo import Study
-from hilbo.app.slices import Maps
-from hilbo.session import actions
-from hilbo.session.headers import header_for
-from hilbo.session.look_ahead import LiveChooser
-from hilbo.session.state import LiveSession
+from hilbo.app.pages.slices import Maps
+from hilbo.session.choose.look_ahead import LiveChooser
+from hilbo.session.log import actions
+from hilbo.session.log.header import header_for
+from hilbo.session.log.state import LiveSession
 
 ONE = Study.from_dict(
     RAW

@@ -9,12 +9,12 @@ import pytest
 from live_server import DATA, PATIENCE, Live, check_blinding, listen, refused
 from live_stimulus import SETS, SINGLE, ByHand, LiveStimulus, Presenter, all_answered, module
 
-from hilbo.app.robot import Client
+from hilbo.app.rehearsal.robot import Client
 from hilbo.cli import doctor
 from hilbo.errors import InputError
-from hilbo.session.export import trials_table
-from hilbo.session.records import Block, Planned
-from hilbo.study.new_study import NewStudy, parameter_of, study_text
+from hilbo.session.export.tables import trials_table
+from hilbo.session.log.records import Block, Planned
+from hilbo.study.template import NewStudy, parameter_of, study_text
 
 ONE = (Block("warm-up", 1, (Planned("best"),)),)
 

@@ -17,9 +17,9 @@ import pytest
 from live_server import PATIENCE, check_blinding, listen
 from live_stimulus import SETS, ByHand, LiveStimulus
 
-from hilbo.session.event_log import read_log
-from hilbo.session.records import Block, Planned
-from hilbo.session.state import LiveSession
+from hilbo.session.log.event_log import read_log
+from hilbo.session.log.records import Block, Planned
+from hilbo.session.log.state import LiveSession
 
 MANY = int(os.environ.get("HILBO_FUZZ", "500"))
 REFUSALS = {400, 401, 403, 404, 405, 409, 413}

@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 from killed_session import Session
 
-from hilbo.app.robot import Client
-from hilbo.session.event_log import read_log
-from hilbo.session.look_ahead import Answers
-from hilbo.session.state import LiveSession
+from hilbo.app.rehearsal.robot import Client
+from hilbo.session.choose.look_ahead import Answers
+from hilbo.session.log.event_log import read_log
+from hilbo.session.log.state import LiveSession
 from hilbo.study.config import Study
-from hilbo.study.new_study import NewStudy, parameter_of, study_text
+from hilbo.study.template import NewStudy, parameter_of, study_text
 
 KILLS = int(os.environ.get("HILBO_KILLS", "9"))
 PROGRAM = Path(__file__).parents[1] / "support" / "presents.py"

@@ -6,15 +6,15 @@ import xarray as xr
 from live_server import check_blinding, refused
 from live_stimulus import SETS, SINGLE, LiveLevels, all_answered
 
-from hilbo.app.lines import lines_of
-from hilbo.app.log_words import table
-from hilbo.app.robot import browser, find_browser
-from hilbo.app.slices import Maps
-from hilbo.app.stand_in import StandIn
-from hilbo.session.export import sets_table, trials_table
-from hilbo.session.netcdf import netcdf
-from hilbo.session.psych_ds import psych_ds
-from hilbo.session.records import Block
+from hilbo.app.pages.log_words import table
+from hilbo.app.pages.slices import Maps
+from hilbo.app.rehearsal.robot import browser, find_browser
+from hilbo.app.rehearsal.stand_in import StandIn
+from hilbo.app.wire.lines import lines_of
+from hilbo.session.export.netcdf import netcdf
+from hilbo.session.export.psych_ds import psych_ds
+from hilbo.session.export.tables import sets_table, trials_table
+from hilbo.session.log.records import Block
 from hilbo.study.cohort import cohort_of
 
 LEVELS = ("silk", "wood", "smooth stone")

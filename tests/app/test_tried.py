@@ -11,14 +11,14 @@ from live_server import DATA, PATIENCE, refused
 from live_stimulus import ByHand
 from try_person import Person
 
-from hilbo.app import serve
-from hilbo.app.opening import Wanted, opened
-from hilbo.app.robot import Client
-from hilbo.app.tried import FIXED, NAMES, Tried, check_study, hidden_reference
+from hilbo.app.hub.opening import Wanted, opened
+from hilbo.app.rehearsal.robot import Client
+from hilbo.app.server import serve
+from hilbo.app.server.tried import FIXED, NAMES, Tried, check_study, hidden_reference
 from hilbo.cli.tried import study_text
 from hilbo.errors import InputError
-from hilbo.session.event_log import read_log
-from hilbo.study.study_file import StudyFile
+from hilbo.session.log.event_log import read_log
+from hilbo.study.file.reading import StudyFile
 
 OWN = study_text(None, 15)
 

@@ -6,9 +6,9 @@ import subprocess
 import pytest
 from try_person import Person
 
-from hilbo.app.rehearsal import HILBO
-from hilbo.app.robot import browser, find_browser
-from hilbo.session.event_log import read_session
+from hilbo.app.rehearsal.rehearsal import HILBO
+from hilbo.app.rehearsal.robot import browser, find_browser
+from hilbo.session.log.event_log import read_session
 from hilbo.study.config import Study
 
 pytestmark = [

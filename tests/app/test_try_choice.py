@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from try_person import Person
 
-from hilbo.app.tried import hidden_reference
+from hilbo.app.server.tried import hidden_reference
 from hilbo.cli.tried import study_text
 from hilbo.ordinal_gp import fit
-from hilbo.session.ask_tell import Session, physical_trials
+from hilbo.session.choose.ask_tell import Session, physical_trials
 from hilbo.study.config import Study
 
 SEEDS, TRIALS = 20, 25

@@ -13,11 +13,11 @@ from helpers_firmware import build, library
 from scipy.stats import qmc
 
 from hilbo import viscoelastic
-from hilbo.app import tried
-from hilbo.app.tried import FIXED, NAMES, STATES
+from hilbo.app.server import tried
+from hilbo.app.server.tried import FIXED, NAMES, STATES
 from hilbo.mechanics.exponentials import TABLE, exponentials
 
-PAGE = Path(tried.__file__).parent / "static" / "try.js"
+PAGE = Path(tried.__file__).parents[1] / "static" / "try.js"
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 
 BOUND = 1e-6  # of the largest displacement

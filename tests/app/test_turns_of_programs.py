@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from live_stimulus import TEXT
 
-from hilbo.app.messages import Hello, Report
-from hilbo.app.stimulus_rig import OverError, StimulusRig
+from hilbo.app.rigs.stimulus_rig import OverError, StimulusRig
+from hilbo.app.wire.messages import Hello, Report
 from hilbo.study.config import Study
 
 SILENCE = 1.05  # s; no sum of the tenths that pass

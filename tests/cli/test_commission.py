@@ -12,13 +12,13 @@ import pytest
 from commands import run
 from simulated import needs_device, own_cache  # noqa: F401
 
-from hilbo.cli.commission import PHRASE
+from hilbo.cli.device.commission import PHRASE
 from hilbo.device.config_header import header, with_measured
 from hilbo.device.messages import HelloReply, Limits
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import Renderer
-from hilbo.identification import commissioning
-from hilbo.identification.friction import Friction, Interval
+from hilbo.identification.motor import commissioning
+from hilbo.identification.motor.friction import Friction, Interval
 
 pytestmark = needs_device
 

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from hilbo.cli.console import _Pace, progress, results
+from hilbo.cli.terminal.console import _Pace, progress, results
 from hilbo.errors import InputError
 
 
@@ -81,7 +81,7 @@ def test_what_came_meanwhile_stays(tmp_path, force):
 def test_openblas_has_one_thread_unless_it_was_told_otherwise(given, holds):
     """In a process of its own, since it is told before NumPy is loaded: `import jax` takes the test's time."""
     code = (
-        "import sys; from hilbo.cli.console import start\n"
+        "import sys; from hilbo.cli.terminal.console import start\n"
         "assert 'numpy' not in sys.modules; start()\n"
         "import os; print(os.environ['OPENBLAS_NUM_THREADS'])"
     )

@@ -16,10 +16,10 @@ import pytest
 from commands import run
 from simulated import ENVIRONMENT, needs_device, own_cache  # noqa: F401
 
-from hilbo.cli.device_screen import trace
+from hilbo.cli.device.screen import trace
 from hilbo.device import protocol
-from hilbo.device.simulator import Simulator
-from hilbo.study.set_table import read_sets
+from hilbo.device.local.simulator import Simulator
+from hilbo.study.tables.parameter_sets import read_sets
 
 pytestmark = needs_device
 
@@ -355,7 +355,7 @@ def test_a_trace_shows_the_largest_excursions():
 
 
 def test_every_message_of_a_capture_can_be_shown():
-    from hilbo.cli.device_output import _field
+    from hilbo.cli.device.output import _field
 
     assert _field((protocol.Exponential(0.5, 0.25),)) == "(0.5,0.25)"
     assert _field(b"\x01\xff") == "01ff"

@@ -3,8 +3,8 @@
 import pytest
 
 from hilbo.cli import doctor
-from hilbo.study.new_study import NewStudy, parameter_of, study_text
-from hilbo.study.study_file import StudyFile
+from hilbo.study.file.reading import StudyFile
+from hilbo.study.template import NewStudy, parameter_of, study_text
 
 
 @pytest.fixture

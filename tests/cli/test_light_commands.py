@@ -8,9 +8,9 @@ import pytest
 from live import Driver
 from simulated import ENVIRONMENT, ROOT, needs_device
 
-from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.plan import make_plan
-from hilbo.study.study_file import StudyFile
+from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.plan.plan import make_plan
+from hilbo.study.file.reading import StudyFile
 
 PAPER = str(ROOT / "hilbo" / "data" / "paper.toml")
 PLAIN = """\

@@ -12,11 +12,11 @@ import hilbo as hilbo_package
 from hilbo import Study
 from hilbo.cli import doctor, main
 from hilbo.errors import InputError
-from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.plan import make_plan, planned_header
-from hilbo.session.records import Block
+from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.log.records import Block
+from hilbo.session.plan.plan import make_plan, planned_header
 from hilbo.study.folder import read_folder
-from hilbo.study.validation_table import read_validation, sets_frame
+from hilbo.study.tables.validation import read_validation, sets_frame
 
 TOML = """\
 schema = 1
@@ -201,7 +201,7 @@ def test_a_plan_takes_no_result_that_is_none(hilbo, tmp_path, changes, sentence)
 
 def test_a_result_that_was_changed_is_refused(hilbo, tmp_path):
     from hilbo.report.participants import json_lines
-    from hilbo.study.typed_files import sealed
+    from hilbo.study.formats.json_file import sealed
 
     (tmp_path / "study.toml").write_text(TOML.format(trials=6))
     text = "".join(sealed(json_lines(a_result(Study.load("study.toml")))))

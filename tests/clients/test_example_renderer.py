@@ -13,8 +13,8 @@ from device_port import FIRMWARE, program
 from live_stimulus import CLIENTS, LiveStimulus, all_answered
 from simulated import ENVIRONMENT, needs_device, own_cache  # noqa: F401
 
-from hilbo.device.motor import SimulatedMotor
-from hilbo.session.records import Block, Planned
+from hilbo.device.local.motor import SimulatedMotor
+from hilbo.session.log.records import Block, Planned
 
 pytestmark = [pytest.mark.deep, needs_device]
 RENDERED = {

@@ -19,7 +19,7 @@ from killed_session import PATIENCE, Session
 from live_stimulus import CLIENTS, SETS, SINGLE, LiveLevels, LiveStimulus, all_answered
 
 from hilbo.study.config import Study
-from hilbo.study.new_study import NewStudy, parameter_of, study_text
+from hilbo.study.template import NewStudy, parameter_of, study_text
 
 pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")]
 SILENCE, OWN = 1.0, 0.05  # s: the study's, and what the examples state

@@ -16,7 +16,7 @@ import pytest
 from client_programs import of_languages, sources
 from live_server import PATIENCE
 
-from hilbo.app.robot import Client
+from hilbo.app.rehearsal.robot import Client
 
 pytestmark = pytest.mark.deep
 ROOT = Path(__file__).parents[2]

@@ -10,9 +10,9 @@ from hilbo.device import protocol
 from hilbo.device.link import Link
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, Renderer, State
-from hilbo.identification import commissioning
-from hilbo.identification.commissioning import Bounds, commission, damping_for, delay_for, find_signs
-from hilbo.identification.friction import Friction, Interval
+from hilbo.identification.motor import commissioning
+from hilbo.identification.motor.commissioning import Bounds, commission, damping_for, delay_for, find_signs
+from hilbo.identification.motor.friction import Friction, Interval
 
 pytestmark = needs_device
 

@@ -9,14 +9,14 @@ from simulated import ENVIRONMENT, FaultyPort, needs_device, own_cache  # noqa: 
 
 from hilbo.device import protocol
 from hilbo.device.link import Link
+from hilbo.device.local.simulator import Simulator
 from hilbo.device.protocol import NackReason, SampleFlag
-from hilbo.device.simulator import Simulator
 from hilbo.device.telemetry import Samples
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, RefusalError, Renderer, State
-from hilbo.identification import device_tests
 from hilbo.identification.material_tables import read_material
-from hilbo.identification.pressing import pressed
+from hilbo.identification.motor import device_tests
+from hilbo.identification.motor.pressing import pressed
 from hilbo.identification.sampled import Sampled
 from hilbo.viscoelastic import FOSLS
 

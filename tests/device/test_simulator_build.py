@@ -6,7 +6,7 @@ import sys
 import pytest
 from simulated import ENVIRONMENT, needs_device, own_cache  # noqa: F401
 
-from hilbo.device import compiled, simulator
+from hilbo.device.local import compiled, simulator
 from hilbo.hardware_bridge import DeviceError, Renderer
 
 pytestmark = needs_device
@@ -45,7 +45,7 @@ def test_sources_that_do_not_compile_are_one_sentence(monkeypatch, tmp_path):
 @pytest.mark.deep
 def test_two_that_build_at_once_do_no_harm(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    code = "from hilbo.device.simulator import built; print(built())"
+    code = "from hilbo.device.local.simulator import built; print(built())"
     env = ENVIRONMENT | {"XDG_CACHE_HOME": str(tmp_path)}
     both = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=env) for _ in "ab"]
     said = {process.communicate()[0].strip() for process in both}

@@ -13,9 +13,9 @@ from simulated import needs_device, own_cache  # noqa: F401
 from slow_line import SlowLine
 
 from hilbo.device import protocol
+from hilbo.device.local.simulator import Simulator
 from hilbo.device.protocol import Estop, Start
 from hilbo.device.reasons import SampleFlag
-from hilbo.device.simulator import Simulator
 from hilbo.hardware_bridge import DeviceError, Renderer
 
 pytestmark = [needs_device, pytest.mark.deep]  # 2 to 6 s each, of real time

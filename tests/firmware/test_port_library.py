@@ -12,8 +12,8 @@ from host_runs import SOFT, Recorded, float_bits, held_for, replayed, running
 from simulated import needs_device, own_cache  # noqa: F401
 
 from hilbo.device.failures import DeviceError
-from hilbo.device.library import Fate
-from hilbo.device.motor import MOTOR
+from hilbo.device.local.library import Fate
+from hilbo.device.local.motor import MOTOR
 from hilbo.device.reasons import HoldReason, State
 
 pytestmark = needs_device

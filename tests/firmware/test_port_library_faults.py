@@ -11,8 +11,8 @@ from device_port import program
 from host_runs import Row, float_bits, replayed
 from simulated import needs_device, own_cache  # noqa: F401
 
-from hilbo.device.library import Fate
-from hilbo.device.motor import MOTOR, SimulatedMotor
+from hilbo.device.local.library import Fate
+from hilbo.device.local.motor import MOTOR, SimulatedMotor
 from hilbo.device.reasons import State
 
 pytestmark = needs_device

@@ -12,8 +12,8 @@ from host_runs import SOFT, Recorded
 from simulated import needs_device, own_cache  # noqa: F401
 
 from hilbo.device.failures import DeviceError
-from hilbo.device.library import Fate, HostRenderer, K0_of
-from hilbo.device.motor import MOTOR
+from hilbo.device.local.library import Fate, HostRenderer, K0_of
+from hilbo.device.local.motor import MOTOR
 from hilbo.errors import InputError
 
 pytestmark = needs_device

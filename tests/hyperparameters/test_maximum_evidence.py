@@ -16,11 +16,11 @@ from hilbo.hyperparameters import maximum_evidence as hyper
 from hilbo.hyperparameters.coordinates import coordinates_of, log_prior, model_at
 from hilbo.numerics.polytope import Polytope
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
-from hilbo.study.aggregate import fit_cohort
+from hilbo.study.analysis.robustness import robustness
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.optima import population_optimum, predict_people
-from hilbo.study.robustness import robustness
+from hilbo.study.estimate.aggregate import fit_cohort
+from hilbo.study.estimate.optimum import population_optimum, predict_people
 from tests.vectors.evidence import three
 
 

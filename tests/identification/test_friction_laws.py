@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilbo.hardware_bridge import DeviceError
-from hilbo.identification.friction import Sweep, friction
+from hilbo.identification.motor.friction import Sweep, friction
 
 LAWS = {
     "viscous + Coulomb": lambda v: 0.05 + 0.95 * v,

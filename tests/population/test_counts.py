@@ -9,8 +9,8 @@ from jax.flatten_util import ravel_pytree
 from benchmarks.people_evidence import learn_people
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
-from hilbo.population.counts import Counts, counts_of, evidence, fit_counts, one_person
-from hilbo.population.hierarchical import fit_people, of_people, predict_shared, shared_posterior
+from hilbo.population.shared.counts import Counts, counts_of, evidence, fit_counts, one_person
+from hilbo.population.shared.hierarchical import fit_people, of_people, predict_shared, shared_posterior
 
 GP = OrdinalGP(RBF(jnp.array([4.0, 2.0]), 1.5), OrdinalProbit((-0.5, 0.5), 0.5))
 

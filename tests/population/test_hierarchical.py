@@ -7,7 +7,7 @@ import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.errors import InputError
-from hilbo.population.hierarchical import NEWCOMER, fit_people, learn_share, of_people, predict_shared
+from hilbo.population.shared.hierarchical import NEWCOMER, fit_people, learn_share, of_people, predict_shared
 
 GP = OrdinalGP(RBF(4.0, 1.0), OrdinalProbit((-0.5, 0.5), 0.5))
 

@@ -11,7 +11,7 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.kernels import gram
 from hilbo.population.joint import joint_map
-from hilbo.study.optima import predict_people
+from hilbo.study.estimate.optimum import predict_people
 
 GP = OrdinalGP(RBF(8.0, 1.7), OrdinalProbit((-0.5, 0.5), 0.5))
 

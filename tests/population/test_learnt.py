@@ -9,12 +9,12 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
 from hilbo.kernels import Matern32
-from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
-from hilbo.population.learnt import drawn_functions, learn, learnt_function
-from hilbo.population.learnt_posterior import NOTHING, Stated, medians, model_at, prior_model
-from hilbo.population.learnt_search import first_search, searched
-from hilbo.population.recipes import LEARNT_1, LEARNT_2
-from hilbo.population.tallies import tallied
+from hilbo.population.learnt.posterior import NOTHING, Stated, medians, model_at, prior_model
+from hilbo.population.learnt.recipes import LEARNT_1, LEARNT_2
+from hilbo.population.learnt.rule import drawn_functions, learn, learnt_function
+from hilbo.population.learnt.search import first_search, searched
+from hilbo.population.shared.hierarchical import fit_people, of_people, shared_posterior
+from hilbo.population.shared.tallies import tallied
 
 PEOPLE, ANSWERS = 4, 12
 

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from hilbo.kernels import RBF
-from hilbo.population import learnt_search
-from hilbo.population.learnt_posterior import NOTHING, Cost
-from hilbo.population.learnt_search import first_search, searched
-from hilbo.population.recipes import LEARNT_1
-from hilbo.population.shared_features import pivots_for, unexplained
-from hilbo.population.tallies import Tallies
+from hilbo.population.learnt import search
+from hilbo.population.learnt.posterior import NOTHING, Cost
+from hilbo.population.learnt.recipes import LEARNT_1
+from hilbo.population.learnt.search import first_search, searched
+from hilbo.population.shared.features import pivots_for, unexplained
+from hilbo.population.shared.tallies import Tallies
 
 COMMON = frozenset({"theta", "shared"})
 
@@ -30,7 +30,7 @@ def searched_by(monkeypatch, cost, theta=(0.0, 0.0)):
         gradient = {"theta": jnp.asarray(slope[:2]), "shared": jnp.asarray(slope[2])}
         return Cost(jnp.asarray(value), gradient, jnp.asarray(-value), weights, jnp.asarray(usable))
 
-    monkeypatch.setattr(learnt_search, "cost_at", cost_at)
+    monkeypatch.setattr(search, "cost_at", cost_at)
     start = {"theta": jnp.asarray(theta), "shared": jnp.asarray(0.0), "own": jnp.asarray(0.0)}
     start |= {"middle": jnp.asarray(0.0), "gaps": jnp.zeros(0)}
     return searched(*first_search(start, one_answer(), NOTHING, LEARNT_1), COMMON)[0], np.array(places)
@@ -64,7 +64,7 @@ def test_features_that_are_asked_for_again_and_again_end_a_search(monkeypatch):
 
 
 def test_a_search_that_runs_out_of_steps_has_not_ended(monkeypatch):
-    monkeypatch.setattr(learnt_search, "_STEPS", 1)
+    monkeypatch.setattr(search, "_STEPS", 1)
     end, _ = searched_by(monkeypatch, lambda z: bowl(z**3 / 9), (0.5, -0.5))
     assert not end.ended
 

@@ -8,7 +8,7 @@ from scipy.special import ndtr
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
-from hilbo.population.leave_one_out import (
+from hilbo.population.judged.leave_one_out import (
     LeftOut,
     calibration,
     clustered,

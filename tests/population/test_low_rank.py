@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
-from hilbo.population.counts import counts_of, fit_counts
-from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
-from hilbo.population.low_rank import shared_evidence
-from hilbo.population.people_model import PeopleModel
-from hilbo.population.shared_features import pivots_for, pivots_of, unexplained
-from hilbo.population.shared_posterior import shared_function
-from hilbo.population.tallies import Tallies, tallied
+from hilbo.population.shared.counts import counts_of, fit_counts
+from hilbo.population.shared.features import pivots_for, pivots_of, unexplained
+from hilbo.population.shared.hierarchical import fit_people, of_people, shared_posterior
+from hilbo.population.shared.low_rank import shared_evidence
+from hilbo.population.shared.people_model import PeopleModel
+from hilbo.population.shared.posterior import shared_function
+from hilbo.population.shared.tallies import Tallies, tallied
 
 EXACT = 1e-15  # what features may leave where nothing is to be left
 PEOPLE, ANSWERS = 3, 8

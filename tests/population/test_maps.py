@@ -7,9 +7,9 @@ import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.errors import InputError
-from hilbo.population.hierarchical import fit_people, of_people, predict_shared
 from hilbo.population.maps import even_rows, rule_map, share_of
 from hilbo.population.pointwise import RULES, aggregate
+from hilbo.population.shared.hierarchical import fit_people, of_people, predict_shared
 
 GP = OrdinalGP(RBF(4.0, 1.3), OrdinalProbit((-0.5, 0.5), 0.5))
 X = jnp.asarray(np.random.default_rng(9).uniform(size=(6, 2)))

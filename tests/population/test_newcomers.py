@@ -22,14 +22,14 @@ from hilbo.population.pointwise import RULES
 from hilbo.report.figures import regions
 from hilbo.report.figures import study as plotting_study
 from hilbo.report.figures.maps import Slice
-from hilbo.study import analysis
-from hilbo.study.aggregate import Aggregate, fit_cohort
-from hilbo.study.batch_optimum import _optimum_at, _variance_apart
+from hilbo.study.analysis import analysis
+from hilbo.study.analysis.heterogeneity import in_place
+from hilbo.study.analysis.progress import _map_by_points
+from hilbo.study.analysis.tolerance_intervals import _dominant_in_draws
 from hilbo.study.cohort import Cohort
-from hilbo.study.heterogeneity import in_place
-from hilbo.study.optima import map_optimum, predict_people
-from hilbo.study.progress import _map_by_points
-from hilbo.study.tolerance_intervals import _dominant_in_draws
+from hilbo.study.estimate.aggregate import Aggregate, fit_cohort
+from hilbo.study.estimate.batch_optimum import _optimum_at, _variance_apart
+from hilbo.study.estimate.optimum import map_optimum, predict_people
 
 STUDY = plain()
 SHARE, PEOPLE = 0.4, 3

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from hilbo import OrdinalGP, Trials, fit
-from hilbo.population.hierarchical import NEWCOMER, PersonKernel
-from hilbo.population.leave_one_out import _newcomer
-from hilbo.population.low_rank import shared_evidence
+from hilbo.population.judged.leave_one_out import _newcomer
 from hilbo.population.maps import RuleMap
-from hilbo.population.people_model import PeopleModel
-from hilbo.population.shared_features import pivots_of
-from hilbo.population.shared_posterior import shared_function
-from hilbo.population.tallies import Tallies, tallied
+from hilbo.population.shared.features import pivots_of
+from hilbo.population.shared.hierarchical import NEWCOMER, PersonKernel
+from hilbo.population.shared.low_rank import shared_evidence
+from hilbo.population.shared.people_model import PeopleModel
+from hilbo.population.shared.posterior import shared_function
+from hilbo.population.shared.tallies import Tallies, tallied
 
 EXACT, PEOPLE, ANSWERS, CONTEXTS, RANK = 1e-15, 3, 8, 3, 24
 NOWHERE = -1.0  # a context that nobody was asked in

@@ -11,8 +11,8 @@ from scipy.stats import binomtest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
-from hilbo.population import response_quality
-from hilbo.population.response_quality import excluded, measure_people, repeats
+from hilbo.population.judged import response_quality
+from hilbo.population.judged.response_quality import excluded, measure_people, repeats
 
 CASE = SMALL[0]()
 

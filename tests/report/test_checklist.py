@@ -8,7 +8,7 @@ import pytest
 from studies import plain
 
 from hilbo.kernels import Matern32
-from hilbo.report.checklist import _model, _posterior
+from hilbo.report.study.checklist import _model, _posterior
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 from studies import PLAIN, paper_counts, plain
 
-from hilbo.report.comparison import _COLUMNS
-from hilbo.report.dictionary import dictionary
+from hilbo.report.study.comparison import _COLUMNS
+from hilbo.report.study.dictionary import dictionary
 from hilbo.report.validation import validate, validation_csv
 from hilbo.study.config import Study
 

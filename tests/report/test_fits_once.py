@@ -7,8 +7,8 @@ from fits import count_fits
 from studies import answered, plain_study
 
 from hilbo.report.results import write_results
-from hilbo.report.study import write_study
-from hilbo.study.cohort_results import analyse_cohort
+from hilbo.report.study.report import write_study
+from hilbo.study.analysis.cohort_results import analyse_cohort
 from hilbo.study.folder import Material, StudyFolder
 
 pytestmark = [pytest.mark.deep, pytest.mark.empties_caches]

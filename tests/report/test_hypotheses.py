@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from studies import plain
 
-from hilbo.report.hypotheses import _individuals, _largest, _validation
+from hilbo.report.study.hypotheses import _individuals, _largest, _validation
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from jax import numpy as jnp
 
 from hilbo.kernels import RBF, Matern32
-from hilbo.population.recipes import RECIPES
+from hilbo.population.learnt.recipes import RECIPES
 from hilbo.report.kernel_words import covariance_words, formula
 
 X, Y = np.array([0.1, 0.7]), np.array([0.4, 0.5])

@@ -8,9 +8,9 @@ import pytest
 from jinja2 import UndefinedError
 from studies import plain_study
 
-from hilbo.report import study as study_report
 from hilbo.report.page import _environment, rendered
 from hilbo.report.robustness import robustness_page
+from hilbo.report.study import report as study_report
 from hilbo.search.rendering import set_of
 from hilbo.study.folder import StudyFolder
 

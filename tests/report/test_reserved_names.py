@@ -16,18 +16,18 @@ from studies import PLAIN
 
 from hilbo import Study
 from hilbo.errors import InputError
-from hilbo.report.comparison import comparison_table
-from hilbo.report.dictionary import dictionary
 from hilbo.report.participants import People
-from hilbo.report.result_tables import alternatives_table
 from hilbo.report.results import moved, optima_table
-from hilbo.report.study import _alternatives
-from hilbo.session.export import sets_table, trials_table
+from hilbo.report.study.comparison import comparison_table
+from hilbo.report.study.dictionary import dictionary
+from hilbo.report.study.report import _alternatives
+from hilbo.report.study.result_tables import alternatives_table
+from hilbo.session.export.tables import sets_table, trials_table
 from hilbo.simulation.simulate import to_table, truth_table
 from hilbo.simulation.validation_sessions import sets_table as simulated_sets
-from hilbo.study.map_file import map_dataset
-from hilbo.study.map_summary import Sets
-from hilbo.study.reserved_names import is_reserved
+from hilbo.study.analysis.tolerance import Sets
+from hilbo.study.file.reserved_names import is_reserved
+from hilbo.study.results.map_netcdf import map_dataset
 from hilbo.trials import Trials
 
 ONE = np.array([0.5, 0.25])

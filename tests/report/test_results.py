@@ -16,10 +16,10 @@ from hilbo.report import participants, results
 from hilbo.report.page import results_page
 from hilbo.search.box import Constraint
 from hilbo.search.rendering import K0_range, margin_of, set_of
-from hilbo.study.aggregate import aggregate_cohort
-from hilbo.study.cohort_results import analyse_cohort
+from hilbo.study.analysis.cohort_results import analyse_cohort
 from hilbo.study.config import Study
-from hilbo.study.optima import predict_people
+from hilbo.study.estimate.aggregate import aggregate_cohort
+from hilbo.study.estimate.optimum import predict_people
 
 PAPER = Study.load("hilbo/data/paper.toml")
 SYSTEM_IDENTIFICATION = (5.70, 5.89, 0.203)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hilbo.cli.console import results
+from hilbo.cli.terminal.console import results
 from hilbo.errors import InputError
 
 

@@ -18,25 +18,25 @@ from studies import paper_counts, plain
 
 from hilbo import Study, Trials
 from hilbo.population.maps import ALL_RULES, RuleMap
-from hilbo.report.comparison import comparison_section
 from hilbo.report.figures.people import people_figure
 from hilbo.report.figures.progress import individual_convergence
-from hilbo.report.hypotheses import _convergence, _materials, _nearer_to_others
-from hilbo.report.study import _alternatives, _shown, _tolerances
-from hilbo.report.study_figures import comparison_figures
+from hilbo.report.study.comparison import comparison_section
+from hilbo.report.study.hypotheses import _convergence, _materials, _nearer_to_others
+from hilbo.report.study.report import _alternatives, _shown, _tolerances
+from hilbo.report.study.study_figures import comparison_figures
 from hilbo.report.validation import validate
 from hilbo.search.box import Parameter
-from hilbo.study.aggregate import fit_cohort
-from hilbo.study.analysis import limits_of
+from hilbo.study.analysis.analysis import limits_of
+from hilbo.study.analysis.progress import Progress, _counts, _splits, _to_other_half
+from hilbo.study.analysis.robustness import _resampled
+from hilbo.study.analysis.tolerance import tolerance
+from hilbo.study.analysis.tolerance_intervals import tolerance_ends
 from hilbo.study.cohort import Cohort, cohort_of
-from hilbo.study.inference_data import groups, predictive_shares, write_groups
-from hilbo.study.map_summary import tolerance
-from hilbo.study.new_study import NewStudy, study_text
-from hilbo.study.optima import predict_people
-from hilbo.study.progress import Progress, _counts, _splits, _to_other_half
-from hilbo.study.reserved_names import is_reserved
-from hilbo.study.robustness import _resampled
-from hilbo.study.tolerance_intervals import tolerance_ends
+from hilbo.study.estimate.aggregate import fit_cohort
+from hilbo.study.estimate.optimum import predict_people
+from hilbo.study.file.reserved_names import is_reserved
+from hilbo.study.results.arviz_groups import groups, predictive_shares, write_groups
+from hilbo.study.template import NewStudy, study_text
 
 
 def crowd(answers):

@@ -11,8 +11,8 @@ from commands import run
 from studies import PLAIN, paper_counts, plain
 
 from hilbo import Study
-from hilbo.report.dictionary import dictionary
 from hilbo.report.page import rendered
+from hilbo.report.study.dictionary import dictionary
 from hilbo.report.validation import (
     folder_names,
     p_words,
@@ -24,7 +24,7 @@ from hilbo.report.validation import (
 )
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.validation_sessions import sets_table, validation_table
-from hilbo.study.map_summary import Sets
+from hilbo.study.analysis.tolerance import Sets
 
 COLUMNS = ["participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred"]
 

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from live import CHOOSER, KINDS, SETS, STUDY, Driver, header
 
+from hilbo.app.pages.session_views import experimenter_view, participant_view
 from hilbo.errors import InputError
-from hilbo.session import actions as live
-from hilbo.session.export import presentations_table
-from hilbo.session.records import Event, Header, RefusedError
-from hilbo.session.state import LiveSession
-from hilbo.session.views import experimenter_view, participant_view
+from hilbo.session.export.tables import presentations_table
+from hilbo.session.log import actions as live
+from hilbo.session.log.records import Event, Header, RefusedError
+from hilbo.session.log.state import LiveSession
 
 anything = st.lists(st.tuples(st.sampled_from(KINDS), st.integers(0, 1000)), max_size=60)
 

@@ -14,7 +14,7 @@ from live import STUDY as SMALL
 from hilbo import Session, Study
 from hilbo.acquisition import UCB, LogEI, Mean, TopCategory
 from hilbo.errors import InputError
-from hilbo.session.ask_tell import physical_trials
+from hilbo.session.choose.ask_tell import physical_trials
 
 PAPER = "hilbo/data/paper.toml"
 DIFFERENTIABLE = ("top_category", "mean", "log_ei")

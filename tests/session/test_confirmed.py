@@ -11,14 +11,14 @@ from live import CHOOSER, RAW, SETS, beginning, header
 
 from hilbo import Study
 from hilbo.errors import InputError
-from hilbo.session import actions as live
-from hilbo.session.confirmed import check_confirmed, counted
-from hilbo.session.export import sets_table, trials_table, validation_table
-from hilbo.session.header_check import check_new_header
-from hilbo.session.look_ahead import Answers
-from hilbo.session.psych_ds import psych_ds
-from hilbo.session.records import Block, Planned, RefusedError
-from hilbo.session.state import LiveSession
+from hilbo.session.choose.look_ahead import Answers
+from hilbo.session.export.psych_ds import psych_ds
+from hilbo.session.export.tables import sets_table, trials_table, validation_table
+from hilbo.session.log import actions as live
+from hilbo.session.log.header_check import check_new_header
+from hilbo.session.log.presented import check_confirmed, counted
+from hilbo.session.log.records import Block, Planned, RefusedError
+from hilbo.session.log.state import LiveSession
 
 STUDY = Study.from_dict(RAW | {"stimulus": {"tolerance": {"u": 0.01}, "within": 2.0}})
 ASKED = SETS["A"]

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilbo.session.counterbalance import block_size, comparisons, orders, williams
+from hilbo.session.plan.counterbalance import block_size, comparisons, orders, williams
 
 
 def neighbours(rows):

@@ -14,17 +14,17 @@ from live import CHOOSER, RAW, STUDY, Driver, header
 
 from hilbo import Study
 from hilbo.errors import InputError
-from hilbo.session import actions as live
-from hilbo.session.event_log import EventLog, LogError, begun, log_name, log_paths, read_log
-from hilbo.session.records import Event
-from hilbo.session.state import LiveSession
+from hilbo.session.log import actions as live
+from hilbo.session.log.event_log import EventLog, LogError, begun, log_name, log_paths, read_log
+from hilbo.session.log.records import Event
+from hilbo.session.log.state import LiveSession
 
 CHILD = """
 import sys
 sys.path[:0] = ["tests/support", "."]
 from live import STUDY, CHOOSER, Driver, header
-from hilbo.session import actions as live
-from hilbo.session.event_log import EventLog
+from hilbo.session.log import actions as live
+from hilbo.session.log.event_log import EventLog
 """
 
 

@@ -13,17 +13,17 @@ from live import RAW, STUDY, Driver
 
 from hilbo import Study
 from hilbo.errors import InputError
-from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.export import read_log_trials, read_sessions, sets_table, trials_table
-from hilbo.session.netcdf import netcdf
-from hilbo.session.participants import add_person, check_consent, read_people
-from hilbo.session.psych_ds import psych_ds
-from hilbo.session.withdrawal import delete_participant
-from hilbo.study.aggregate import fit_cohort
+from hilbo.session.export.netcdf import netcdf
+from hilbo.session.export.psych_ds import psych_ds
+from hilbo.session.export.tables import read_log_trials, read_sessions, sets_table, trials_table
+from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.plan.participants import add_person, check_consent, read_people
+from hilbo.session.withdrawal.withdrawal import delete_participant
 from hilbo.study.cohort import cohort_of
-from hilbo.study.inference_data import groups, write_groups
-from hilbo.study.trial_table import read_trials
-from hilbo.study.validation_table import read_validation, sets_frame
+from hilbo.study.estimate.aggregate import fit_cohort
+from hilbo.study.results.arviz_groups import groups, write_groups
+from hilbo.study.tables.trials import read_trials
+from hilbo.study.tables.validation import read_validation, sets_frame
 
 
 def write(folder, person, kind, session, doings=(), **facts):

@@ -8,12 +8,12 @@ import pytest
 from fits import count_fits
 from live import STUDY, beginning, header
 
-from hilbo.app.slices import Maps
+from hilbo.app.pages.slices import Maps
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
-from hilbo.session import actions as live
-from hilbo.session.look_ahead import LiveChooser
-from hilbo.session.records import Block
-from hilbo.session.state import LiveSession
+from hilbo.session.choose.look_ahead import LiveChooser
+from hilbo.session.log import actions as live
+from hilbo.session.log.records import Block
+from hilbo.session.log.state import LiveSession
 
 pytestmark = pytest.mark.empties_caches
 

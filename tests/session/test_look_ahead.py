@@ -9,20 +9,20 @@ import pytest
 from live import RAW, STUDY, beginning, header
 
 from hilbo import Session, Study
+from hilbo.app.pages.pace import minutes_left
 from hilbo.errors import InputError
 from hilbo.search.candidates import search_points
-from hilbo.session import actions as live
-from hilbo.session import explanation
-from hilbo.session.event_log import EventLog, log_name, read_log
-from hilbo.session.excluded import APART, spread_point, when_nothing_is_apart
-from hilbo.session.headers import header_for
-from hilbo.session.logged_session import LoggedSession
-from hilbo.session.look_ahead import Answers, LiveChooser, _missing
-from hilbo.session.pace import minutes_left
-from hilbo.session.progress import consistency, trust_of
-from hilbo.session.records import Block
-from hilbo.session.state import LiveSession
-from hilbo.session.warm_start import informed, warm_point, warm_start
+from hilbo.session.choose import explanation
+from hilbo.session.choose.avoided import APART, spread_point, when_nothing_is_apart
+from hilbo.session.choose.logged_session import LoggedSession
+from hilbo.session.choose.look_ahead import Answers, LiveChooser, _missing
+from hilbo.session.choose.progress import consistency, trust_of
+from hilbo.session.choose.warm_start import informed, warm_point, warm_start
+from hilbo.session.log import actions as live
+from hilbo.session.log.event_log import EventLog, log_name, read_log
+from hilbo.session.log.header import header_for
+from hilbo.session.log.records import Block
+from hilbo.session.log.state import LiveSession
 
 ANSWERS = ("similar", "different", "close", "close", "similar", "close")
 

@@ -8,8 +8,9 @@ import time
 import pytest
 
 from hilbo.errors import InputError
-from hilbo.session import file_lock, participants
-from hilbo.session.participants import add_person, check_consent, read_people
+from hilbo.session.log import file_lock
+from hilbo.session.plan import participants
+from hilbo.session.plan.participants import add_person, check_consent, read_people
 
 
 def person(name, consent="2026-05-04T10:15"):

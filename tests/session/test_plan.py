@@ -10,18 +10,18 @@ import pytest
 from live import RAW, STUDY
 
 from hilbo import Study
+from hilbo.app.pages.session_views import participant_view
 from hilbo.errors import InputError
-from hilbo.session import actions as live
-from hilbo.session.headers import header_for, material_seed, warm_up
-from hilbo.session.look_ahead import LiveChooser
-from hilbo.session.plan import make_plan, plan_hash, planned_header, reissue
-from hilbo.session.plan_sets import aggregate_best_sets, check_participants, validation_sets
-from hilbo.session.records import Block
-from hilbo.session.state import LiveSession
-from hilbo.session.views import participant_view
+from hilbo.session.choose.look_ahead import LiveChooser
+from hilbo.session.log import actions as live
+from hilbo.session.log.header import header_for, material_seed, warm_up
+from hilbo.session.log.records import Block
+from hilbo.session.log.state import LiveSession
+from hilbo.session.plan.plan import make_plan, plan_hash, planned_header, reissue
+from hilbo.session.plan.validation_sets import aggregate_best_sets, check_participants, validation_sets
 from hilbo.study.cohort import cohort_of
-from hilbo.study.protocols import protocol
-from hilbo.study.result_file import FoundOptimum, FoundPerson, Result, read_result
+from hilbo.study.file.protocols import protocol
+from hilbo.study.results.result_json import FoundOptimum, FoundPerson, Result, read_result
 
 PEOPLE = [f"P{i:02d}" for i in range(1, 9)]
 SETS = {name: {"u": 0.1 + 0.3 * i, "v": 0.9 - 0.2 * i} for i, name in enumerate(("best", "mid", "worst"))}

@@ -7,15 +7,15 @@ from live import CHOOSER, RAW
 
 from hilbo import Study
 from hilbo.report.validation import validate, validation_figures
-from hilbo.session import actions as live
-from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.export import read_sessions, sets_table
-from hilbo.session.plan import make_plan, planned_header
-from hilbo.session.psych_ds import psych_ds
-from hilbo.session.records import Block, Header, Planned
-from hilbo.session.state import LiveSession
+from hilbo.session.export.psych_ds import psych_ds
+from hilbo.session.export.tables import read_sessions, sets_table
+from hilbo.session.log import actions as live
+from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.log.records import Block, Header, Planned
+from hilbo.session.log.state import LiveSession
+from hilbo.session.plan.plan import make_plan, planned_header
 from hilbo.statistics.paper_tables import paper_tables
-from hilbo.study.validation_table import read_validation, sets_frame
+from hilbo.study.tables.validation import read_validation, sets_frame
 
 MATERIALS = ("foam", "soft")
 STUDY = Study.from_dict(RAW | {"materials": {name: {} for name in MATERIALS}})

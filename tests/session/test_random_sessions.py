@@ -17,12 +17,12 @@ import pytest
 from live import RAW, beginning
 
 from hilbo import Study
-from hilbo.session import actions as live
-from hilbo.session.headers import header_for
-from hilbo.session.plan import make_plan, planned_header
-from hilbo.session.records import RefusedError
-from hilbo.session.state import LiveSession
-from hilbo.session.views import experimenter_view, participant_view
+from hilbo.app.pages.session_views import experimenter_view, participant_view
+from hilbo.session.log import actions as live
+from hilbo.session.log.header import header_for
+from hilbo.session.log.records import RefusedError
+from hilbo.session.log.state import LiveSession
+from hilbo.session.plan.plan import make_plan, planned_header
 
 MATERIALS = ("foam", "soft", "hard")
 STUDY = Study.from_dict(

@@ -7,13 +7,13 @@ import pytest
 from commands import run
 
 from hilbo.errors import InputError
-from hilbo.population.recipes import RECIPES
-from hilbo.session.plan import make_plan, reissue
-from hilbo.session.registration import registration
+from hilbo.population.learnt.recipes import RECIPES
+from hilbo.report.registration import registration
+from hilbo.session.plan.plan import make_plan, reissue
 from hilbo.study.departures import Held, departures
-from hilbo.study.new_study import NewStudy, parameter_of, study_text
-from hilbo.study.optima import _LOSS
-from hilbo.study.study_file import StudyFile
+from hilbo.study.estimate.optimum import _LOSS
+from hilbo.study.file.reading import StudyFile
+from hilbo.study.template import NewStudy, parameter_of, study_text
 
 PAPER = Path("hilbo/data/paper.toml")
 TEXT = PAPER.read_text()

@@ -9,9 +9,9 @@ import pytest
 from live import STUDY, Driver
 
 from hilbo.errors import InputError
-from hilbo.session.event_log import EventLog
-from hilbo.session.export import read_sessions
-from hilbo.session.psych_ds import psych_ds
+from hilbo.session.export.psych_ds import psych_ds
+from hilbo.session.export.tables import read_sessions
+from hilbo.session.log.event_log import EventLog
 
 
 def write(path, kind):

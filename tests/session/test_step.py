@@ -13,8 +13,8 @@ from hilbo.ordinal_gp import fit
 from hilbo.programs.description import describe
 from hilbo.programs.entries import Entries
 from hilbo.programs.keeping import Programs
-from hilbo.session import selection, step
-from hilbo.session.ask_tell import Session, physical_trials
+from hilbo.session.choose import selection, step
+from hilbo.session.choose.ask_tell import Session, physical_trials
 from hilbo.study.config import Study
 
 POINTS = np.array([[0.2, 0.3], [0.8, 0.7], [0.5, 0.5], [0.4, 0.9]])

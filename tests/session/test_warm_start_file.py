@@ -8,8 +8,8 @@ import xarray as xr
 from live import STUDY
 
 from hilbo.errors import InputError
-from hilbo.session.warm_start import read_warm_start
-from hilbo.study.map_file import map_dataset
+from hilbo.session.choose.warm_start import read_warm_start
+from hilbo.study.results.map_netcdf import map_dataset
 
 
 def grid():
@@ -52,7 +52,7 @@ def test_a_map_of_one_point_along_a_parameter_is_refused(tmp_path):
 
 
 def test_a_damaged_map_is_refused_or_is_what_it_was(tmp_path):
-    from hilbo.study.map_file import write_map
+    from hilbo.study.results.map_netcdf import write_map
 
     path = tmp_path / "map.nc"
     write_map(grid(), path)
@@ -79,7 +79,7 @@ def test_a_map_that_was_made_before_digests_were_is_read(tmp_path):
 
 
 def test_a_map_says_what_it_said_before_it_was_written(tmp_path):
-    from hilbo.study.map_file import read_map, write_map
+    from hilbo.study.results.map_netcdf import read_map, write_map
 
     write_map(grid(), tmp_path / "map.nc")
     xr.testing.assert_identical(read_map(tmp_path / "map.nc", STUDY).drop_attrs(), grid().drop_attrs())

@@ -10,18 +10,19 @@ import pytest
 from commands import run
 from live import STUDY, Driver
 
-from hilbo.cli.console import results
+from hilbo.cli.terminal.console import results
 from hilbo.errors import InputError
-from hilbo.session import file_lock, withdrawal
-from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.participants import read_people
-from hilbo.session.plan import make_plan, plan_hash, planned_header, reissue
-from hilbo.session.records import Block, Header, Planned
-from hilbo.session.withdrawal import delete_participant
-from hilbo.session.withdrawn_results import command_without
-from hilbo.study.results_list import list_files, listed
-from hilbo.study.trial_table import read_trials
-from hilbo.study.validation_table import read_validation, sets_frame
+from hilbo.session.log import file_lock
+from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.log.records import Block, Header, Planned
+from hilbo.session.plan.participants import read_people
+from hilbo.session.plan.plan import make_plan, plan_hash, planned_header, reissue
+from hilbo.session.withdrawal import withdrawal
+from hilbo.session.withdrawal.results import command_without
+from hilbo.session.withdrawal.withdrawal import delete_participant
+from hilbo.study.results.listing import list_files, listed
+from hilbo.study.tables.trials import read_trials
+from hilbo.study.tables.validation import read_validation, sets_frame
 
 SETS = {"best": {"u": 0.5, "v": 0.5}, "own-P02": {"u": 0.1, "v": 0.5}, "own-P01": {"u": 0.2, "v": 0.5}}
 

@@ -12,9 +12,9 @@ import pytest
 from commands import run
 
 from hilbo.errors import InputError
-from hilbo.session import withdrawal
-from hilbo.session.withdrawal import delete_participant
-from hilbo.study.results_list import list_files
+from hilbo.session.withdrawal import withdrawal
+from hilbo.session.withdrawal.withdrawal import delete_participant
+from hilbo.study.results.listing import list_files
 
 TABLE = "participant,trial\nP01,1\nP02,1\n"
 WITHOUT = "participant,trial\nP02,1\n"

@@ -13,7 +13,7 @@ from scipy.stats import binom
 
 from hilbo import Study
 from hilbo.cli import main
-from hilbo.cli.console import start
+from hilbo.cli.terminal.console import start
 from hilbo.errors import InputError
 from hilbo.report.figures.power import power_figure
 from hilbo.report.power import enough, write_power
@@ -27,7 +27,7 @@ from hilbo.simulation.power import (
 )
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import people
-from hilbo.study.learnt_study import by_rule
+from hilbo.study.estimate.learnt import by_rule
 
 
 def study():

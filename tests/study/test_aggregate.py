@@ -14,13 +14,13 @@ from hilbo import bcm
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials, fit
 from hilbo.search.apart import nrmse
-from hilbo.session.ask_tell import physical_trials
-from hilbo.study.aggregate import aggregate_cohort, fit_cohort
+from hilbo.session.choose.ask_tell import physical_trials
+from hilbo.study.analysis.progress import follow
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
-from hilbo.study.optima import predict_people
-from hilbo.study.progress import follow
-from hilbo.study.trial_table import read_trials, write_trials
+from hilbo.study.estimate.aggregate import aggregate_cohort, fit_cohort
+from hilbo.study.estimate.optimum import predict_people
+from hilbo.study.tables.trials import read_trials, write_trials
 
 STUDY = Study.load("hilbo/data/paper.toml")
 

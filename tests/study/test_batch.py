@@ -13,12 +13,12 @@ from studies import PEOPLE, STUDY, population_answers, population_study
 from hilbo.errors import InputError
 from hilbo.population.pointwise import Sums
 from hilbo.search.candidates import search_points
-from hilbo.study import distributed
-from hilbo.study.aggregate import aggregate_cohort, fit_cohort
-from hilbo.study.batch import _one_block, block_size, jets, refit, streamed_cohort, sums
-from hilbo.study.batch_optimum import aggregate_population, optima_from, optimum_near
 from hilbo.study.cohort import cohort_of
-from hilbo.study.optima import population_optimum, predict_people
+from hilbo.study.estimate import distributed
+from hilbo.study.estimate.aggregate import aggregate_cohort, fit_cohort
+from hilbo.study.estimate.batch import _one_block, block_size, jets, refit, streamed_cohort, sums
+from hilbo.study.estimate.batch_optimum import aggregate_population, optima_from, optimum_near
+from hilbo.study.estimate.optimum import population_optimum, predict_people
 
 
 @functools.cache

@@ -7,8 +7,8 @@ import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.kernels import Matern32
-from hilbo.study.best_places import best_places, nearness
 from hilbo.study.config import Study
+from hilbo.study.estimate.best_places import best_places, nearness
 
 STUDY = Study.load("hilbo/data/video_quality.toml")
 SIDE = np.linspace(0.0, 1.0, 41)

@@ -8,7 +8,7 @@ import pytest
 
 from hilbo.errors import InputError
 from hilbo.study.config import Study
-from hilbo.study.study_schema import Selection
+from hilbo.study.file.schema import Selection
 
 GOOD = """\
 schema = 1

@@ -13,8 +13,8 @@ import xarray as xr
 from studies import population_answers
 
 from hilbo.errors import InputError
-from hilbo.study import distributed
-from hilbo.study.trial_table import write_trials
+from hilbo.study.estimate import distributed
+from hilbo.study.tables.trials import write_trials
 
 ROOT = Path(__file__).parents[2]
 STUDY_FILE = """
@@ -41,14 +41,14 @@ space_filling = 2
 MAIN = "from hilbo.cli.main import main; main()"
 DIES = """
 import os, signal
-import hilbo.study.batch_optimum
-hilbo.study.batch_optimum.aggregate_population = lambda *args, **more: os.kill(os.getpid(), signal.SIGKILL)
+import hilbo.study.estimate.batch_optimum
+hilbo.study.estimate.batch_optimum.aggregate_population = lambda *args, **more: os.kill(os.getpid(), signal.SIGKILL)
 """
 FAILS = """
-import hilbo.study.batch_optimum
+import hilbo.study.estimate.batch_optimum
 def fail(*args, **more):
     raise MemoryError("no room")
-hilbo.study.batch_optimum.aggregate_population = fail
+hilbo.study.estimate.batch_optimum.aggregate_population = fail
 """
 
 

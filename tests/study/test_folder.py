@@ -10,7 +10,7 @@ from commands import run
 from hilbo.errors import InputError, InputRemark
 from hilbo.report.validation import validate
 from hilbo.statistics.paper_tables import aggregate_comparisons
-from hilbo.study.analysis import analyse
+from hilbo.study.analysis.analysis import analyse
 from hilbo.study.folder import read_folder
 
 STUDY = Path("hilbo/data/paper.toml").read_text()

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import qmc
 
 from hilbo.kernels import RBF
-from hilbo.study.hills import hills_of
+from hilbo.study.analysis.hills import hills_of
 
 POINTS = qmc.Sobol(2, seed=0).random(1024)
 THETA = np.array([6.0, 6.0])

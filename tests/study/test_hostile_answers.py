@@ -10,10 +10,10 @@ from studies import SOUND
 
 from hilbo.ordinal_gp import Trials
 from hilbo.report.results import result
-from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.learnt_study import resolved
+from hilbo.study.estimate.aggregate import aggregate_cohort
+from hilbo.study.estimate.learnt import resolved
 
 PEOPLE, ANSWERS = 6, 12
 NOWHERE = "The best rendering is not located"

@@ -7,9 +7,9 @@ import pytest
 
 from hilbo.cli import doctor
 from hilbo.errors import InputError
-from hilbo.study.languages import LANGUAGES, language
-from hilbo.study.protocols import SessionTable
-from hilbo.study.study_file import checked
+from hilbo.study.file.languages import LANGUAGES, language
+from hilbo.study.file.protocols import SessionTable
+from hilbo.study.file.reading import checked
 
 FILE = """\
 schema = 1

@@ -16,18 +16,18 @@ from studies import SOUND
 from hilbo import Session
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials
+from hilbo.population.learnt.recipes import RECOMMENDED
 from hilbo.population.maps import learnt_map
-from hilbo.population.recipes import RECOMMENDED
 from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import to_table
-from hilbo.study.aggregate import aggregate_cohort
-from hilbo.study.best_places import best_places, nearness
+from hilbo.study.analysis.robustness import robustness
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
-from hilbo.study.learnt_study import effect_content, learnt_content, learnt_sentences, resolved, that_learns
-from hilbo.study.optima import map_optimum
-from hilbo.study.robustness import robustness
-from hilbo.study.trial_table import read_trials
+from hilbo.study.estimate.aggregate import aggregate_cohort
+from hilbo.study.estimate.best_places import best_places, nearness
+from hilbo.study.estimate.learnt import effect_content, learnt_content, learnt_sentences, resolved, that_learns
+from hilbo.study.estimate.optimum import map_optimum
+from hilbo.study.tables.trials import read_trials
 
 PEOPLE, ANSWERS = 4, 12
 

@@ -15,23 +15,23 @@ from surfaces import SURFACES, TEXTURES, surfaces
 from hilbo import Session
 from hilbo.errors import InputError
 from hilbo.kernels import RBF, Matern32, embedded, gram, theta_of
-from hilbo.population.recipes import RECIPES
+from hilbo.population.learnt.recipes import RECIPES
 from hilbo.search.apart import differences, middle_of, nrmse
 from hilbo.search.rendering import set_of
 from hilbo.simulation.presets import population_of
 from hilbo.simulation.simulate import people
-from hilbo.study import distributed
-from hilbo.study.aggregate import aggregate_cohort
-from hilbo.study.batch import refit, streamed_cohort
-from hilbo.study.batch_optimum import optima_from
+from hilbo.study.analysis.hills import hills_of
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
-from hilbo.study.hills import hills_of
-from hilbo.study.learnt_study import that_learns
-from hilbo.study.new_study import NewStudy, parameter_of, study_text
-from hilbo.study.trial_table import read_trials, write_trials
-from hilbo.study.typed_files import check_values
-from hilbo.study.validation_table import sets_frame
+from hilbo.study.estimate import distributed
+from hilbo.study.estimate.aggregate import aggregate_cohort
+from hilbo.study.estimate.batch import refit, streamed_cohort
+from hilbo.study.estimate.batch_optimum import optima_from
+from hilbo.study.estimate.learnt import that_learns
+from hilbo.study.formats.json_file import check_values
+from hilbo.study.tables.trials import read_trials, write_trials
+from hilbo.study.tables.validation import sets_frame
+from hilbo.study.template import NewStudy, parameter_of, study_text
 
 orders = st.permutations(TEXTURES)
 correlations = st.floats(0.02, 0.98)

@@ -19,7 +19,7 @@ from studies import PLAIN, plain
 from hilbo import Study, passivity
 from hilbo.errors import InputError
 from hilbo.search.candidates import search_points
-from hilbo.study.map_summary import best_mid_worst, dominant, slice_through, tolerance
+from hilbo.study.analysis.tolerance import best_mid_worst, dominant, slice_through, tolerance
 
 POINTS = 1026  # of a slice through an optimum that is between the points of its grid
 

@@ -11,11 +11,11 @@ from studies import answered, plain_study
 
 from hilbo.errors import InputError
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.population.baselines import constant, quadratic
-from hilbo.study.aggregate import aggregate_cohort
+from hilbo.population.judged.baselines import constant, quadratic
+from hilbo.study.analysis.model_check import _compared, _differs, check_sentences, model_check
+from hilbo.study.analysis.rule_comparison import compare
 from hilbo.study.cohort import Cohort
-from hilbo.study.model_check import _compared, _differs, check_sentences, model_check
-from hilbo.study.rule_comparison import compare
+from hilbo.study.estimate.aggregate import aggregate_cohort
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_the_quadratic_of_separated_answers_and_of_a_parameter_that_nobody_varie
 
 def test_the_quadratics_masses_and_slopes():
     """Against differences, and far out in both tails."""
-    from hilbo.population.baselines import _log_masses
+    from hilbo.population.judged.baselines import _log_masses
 
     edges = np.array([-np.inf, -0.5, 0.9, np.inf])
     level, q = np.array([0.3, -2.0, 30.0, -30.0, 1.0]), np.array([1, 0, 1, 1, 2])

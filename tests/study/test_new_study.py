@@ -7,11 +7,11 @@ from hypothesis import given, settings
 
 from hilbo import Study
 from hilbo.errors import InputError
-from hilbo.population.recipes import RECOMMENDED
+from hilbo.population.learnt.recipes import RECOMMENDED
 from hilbo.search.box import Constraint, Parameter
-from hilbo.study.constraint_words import constraint_of
-from hilbo.study.new_study import NewStudy, parameter_of, study_text
-from hilbo.study.study_file import StudyFile
+from hilbo.study.file.constraint_words import constraint_of
+from hilbo.study.file.reading import StudyFile
+from hilbo.study.template import NewStudy, parameter_of, study_text
 
 TEXTS = st.text(max_size=12)
 NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), max_size=12)

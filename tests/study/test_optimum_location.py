@@ -7,7 +7,7 @@ import numpy as np
 from studies import PLAIN
 
 from hilbo.study.config import Study
-from hilbo.study.optimum_location import location_notes, location_sentences, truth_sentence
+from hilbo.study.estimate.location import location_notes, location_sentences, truth_sentence
 
 STUDY = Study.load("hilbo/data/paper.toml")
 SD, ASKED = jnp.asarray(0.3), jnp.asarray(0.25)

@@ -6,9 +6,9 @@ import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.population.maps import RuleMap
+from hilbo.study.analysis.hills import Hill
+from hilbo.study.analysis.region import Region, optimum_region, region_content, region_sentences
 from hilbo.study.config import Study
-from hilbo.study.hills import Hill
-from hilbo.study.optimum_region import Region, optimum_region, region_content, region_sentences
 
 STUDY = Study.load("hilbo/data/video_quality.toml")
 THETA = np.array([6.0, 6.0])

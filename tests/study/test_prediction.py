@@ -10,12 +10,12 @@ from studies import PLAIN
 
 from hilbo import InputError, Study
 from hilbo.report.figures.on_axes import draw_map
-from hilbo.study.aggregate import aggregate_cohort, fit_cohort
+from hilbo.study.analysis.prediction import predict_table
 from hilbo.study.cohort import cohort_of
-from hilbo.study.inference_data import groups, inference_data
-from hilbo.study.prediction import predict_table
-from hilbo.study.reserved_names import is_reserved
-from hilbo.study.trial_table import checked_trials, read_trials
+from hilbo.study.estimate.aggregate import aggregate_cohort, fit_cohort
+from hilbo.study.file.reserved_names import is_reserved
+from hilbo.study.results.arviz_groups import groups, inference_data
+from hilbo.study.tables.trials import checked_trials, read_trials
 
 STUDY = Study.from_dict(PLAIN)
 LOW, HIGH = STUDY.responses[0], STUDY.responses[-1]

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from studies import answered, plain_study
 
-from hilbo.population.hierarchical import Share
-from hilbo.population.leave_one_out import LeftOut, calibration
+from hilbo.population.judged.leave_one_out import LeftOut, calibration
+from hilbo.population.learnt.recipes import RECOMMENDED
 from hilbo.population.maps import GIVEN_RULES
-from hilbo.population.recipes import RECOMMENDED
-from hilbo.report.comparison import write_comparison
-from hilbo.study.aggregate import aggregate_cohort
-from hilbo.study.rule_comparison import recommendation
+from hilbo.population.shared.hierarchical import Share
+from hilbo.report.study.comparison import write_comparison
+from hilbo.study.analysis.rule_comparison import recommendation
+from hilbo.study.estimate.aggregate import aggregate_cohort
 
 
 @pytest.mark.deep

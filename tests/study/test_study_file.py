@@ -6,11 +6,11 @@ from typing import get_args
 import pytest
 
 from hilbo.errors import InputError
+from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.maps import ALL_RULES
-from hilbo.population.recipes import RECIPES
 from hilbo.study.config import Study
-from hilbo.study.study_file import AnyStudy, StudyFile
-from hilbo.study.study_schema import Rule
+from hilbo.study.file.reading import AnyStudy, StudyFile
+from hilbo.study.file.schema import Rule
 
 DATA = Path("hilbo/data")
 GEL = "[materials.gel.renderer]\nK_eff = 0.2\n[materials.gel.parameters.K1]\nhigh = 16.0\n"

@@ -10,13 +10,13 @@ from live import RAW, STUDY, Driver
 from hilbo import Study
 from hilbo.cli import main
 from hilbo.errors import InputError
-from hilbo.session import actions
-from hilbo.session.participants import add_person, read_people
-from hilbo.session.plan import make_plan
-from hilbo.session.records import RefusedError
-from hilbo.study.set_table import read_sets
-from hilbo.study.trial_table import read_trials
-from hilbo.study.validation_table import read_validation
+from hilbo.session.log import actions
+from hilbo.session.log.records import RefusedError
+from hilbo.session.plan.participants import add_person, read_people
+from hilbo.session.plan.plan import make_plan
+from hilbo.study.tables.parameter_sets import read_sets
+from hilbo.study.tables.trials import read_trials
+from hilbo.study.tables.validation import read_validation
 
 FORMULAS = ("=1+1", "@SUM(A1)", "+cmd", "-cmd|' /C calc'!A1", "\t=1+1", "=HYPERLINK(A1)")
 PLAIN = ("-3", "+1.5e-3", "-", "a=1", "P01", "3 - 4")
@@ -135,7 +135,7 @@ def test_an_error_of_the_system_is_a_sentence(tmp_path, monkeypatch, capsys):
         raise OSError(28, "No space left on device", "/tmp/here")
 
     monkeypatch.setattr("pathlib.Path.read_bytes", full)
-    monkeypatch.setattr("hilbo.study.study_file.StudyFile.load", staticmethod(full))
+    monkeypatch.setattr("hilbo.study.file.reading.StudyFile.load", staticmethod(full))
     with pytest.raises(SystemExit) as stopped:
         main.main()
     err = capsys.readouterr().err

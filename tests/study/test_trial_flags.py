@@ -9,12 +9,12 @@ from studies import PLAIN
 
 from hilbo import Study
 from hilbo.errors import InputError, InputRemark
-from hilbo.study.flag_counts import flag_counts
+from hilbo.study.file.reading import StudyFile
+from hilbo.study.file.trial_flags import FLAGS, flag_sentences, flag_words
 from hilbo.study.folder import read_folder
-from hilbo.study.study_file import StudyFile
-from hilbo.study.trial_flags import FLAGS, flag_sentences, flag_words
-from hilbo.study.trial_table import NothingToFitError, read_trials
-from hilbo.study.validation_table import check_validation, read_validation
+from hilbo.study.tables.flag_counts import flag_counts
+from hilbo.study.tables.trials import NothingToFitError, read_trials
+from hilbo.study.tables.validation import check_validation, read_validation
 
 TOML = """\
 schema = 1

@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 
 from hilbo.errors import InputError, InputRemark
-from hilbo.study import cells
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
-from hilbo.study.trial_table import read_trials, write_trials
+from hilbo.study.formats import csv_file
+from hilbo.study.tables.trials import read_trials, write_trials
 
 GP = {"theta": 3.0, "variance": 1.0, "thresholds": [-0.5, 0.5], "noise": 0.5}
 HEADER = "participant,trial,response,gain,delay\n"
@@ -389,13 +389,13 @@ def test_pieces_make_the_same_table(tmp_path, monkeypatch, name):
     if name.endswith("parquet"):
         pd.read_csv(written(tmp_path, HEADER + many(53))).to_parquet(path)
     whole, told = read_trials(path, study()), []
-    monkeypatch.setattr(cells, "_PIECE", 10)
+    monkeypatch.setattr(csv_file, "_PIECE", 10)
     pd.testing.assert_frame_equal(read_trials(path, study(), say=told.append), whole)
     assert told[-1] == 53 and told == sorted(told) and len(told) > 4
 
 
 def test_a_damaged_row_far_down_is_found_with_its_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(cells, "_PIECE", 10)
+    monkeypatch.setattr(csv_file, "_PIECE", 10)
     text = HEADER + many(53)
     assert 't.csv:41: response is "near"' in refusal(tmp_path, text.replace("P7,5,close", "P7,5,near"))
     assert "t.csv:41: has 4 cells" in refusal(tmp_path, text.replace("P7,5,close,1", "P7,5,close"))

@@ -4,8 +4,8 @@ import pandas as pd
 import pytest
 
 from hilbo.errors import InputError
-from hilbo.study.set_table import source_kind
-from hilbo.study.validation_table import check_validation, read_validation, sets_frame
+from hilbo.study.tables.parameter_sets import source_kind
+from hilbo.study.tables.validation import check_validation, read_validation, sets_frame
 
 HEAD = "participant,material,session,trial,set_a,set_b,first,class_a,class_b,preferred"
 GOOD = ["P1,foam,1,1,best,mid,b,close,similar,a", "P1,foam,1,2,mid,worst,mid,2,1,tie", "P2,foam,1,1,best,i1,,,,i1"]

@@ -6,10 +6,10 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from hilbo.app import serve
-from hilbo.app.hub import Hub
-from hilbo.app.robot import Client
-from hilbo.app.watchers import Watchers
+from hilbo.app.hub.hub import Hub
+from hilbo.app.rehearsal.robot import Client
+from hilbo.app.server import serve
+from hilbo.app.wire.watchers import Watchers
 
 __all__ = ["PATIENCE", "Bare", "connected", "request", "status", "until_closed", "until_words"]
 

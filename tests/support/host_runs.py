@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from helpers_firmware import NAMES, build, decode, frame, library, pack, schema, unpack
 
-from hilbo.device.library import DeviceNumbers, Fate, HostRenderer, HostState
-from hilbo.device.motor import MOTOR
+from hilbo.device.local.library import DeviceNumbers, Fate, HostRenderer, HostState
+from hilbo.device.local.motor import MOTOR
 from hilbo.device.reasons import State
 
 __all__ = ["SOFT", "Core", "Recorded", "Row", "float_bits", "held_for", "replayed", "running"]

@@ -11,8 +11,8 @@ import time
 import urllib.error
 from pathlib import Path
 
-from hilbo.app.robot import Client
-from hilbo.session.event_log import read_log
+from hilbo.app.rehearsal.robot import Client
+from hilbo.session.log.event_log import read_log
 
 __all__ = ["PATIENCE", "Session"]
 
@@ -21,7 +21,9 @@ PATIENCE = 120.0  # s: how long what must come is waited for; no test asserts a 
 
 # Forked from a process that has imported everything and computed nothing: a start costs a second instead of several.
 SERVERS = multiprocessing.get_context("forkserver")
-SERVERS.set_forkserver_preload(["hilbo.app.opening", "hilbo.app.server", "hilbo.app.serve", "uvicorn", "pandas"])
+SERVERS.set_forkserver_preload(
+    ["hilbo.app.hub.opening", "hilbo.app.server.server", "hilbo.app.server.serve", "uvicorn", "pandas"]
+)
 
 
 def run_server(arguments, out):

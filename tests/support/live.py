@@ -6,9 +6,9 @@ import itertools
 import json
 
 from hilbo import Study
-from hilbo.session import actions as live
-from hilbo.session.records import Block, Header, Planned, RefusedError
-from hilbo.session.state import LiveSession
+from hilbo.session.log import actions as live
+from hilbo.session.log.records import Block, Header, Planned, RefusedError
+from hilbo.session.log.state import LiveSession
 
 RAW = {
     "schema": 1,

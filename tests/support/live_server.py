@@ -13,20 +13,22 @@ from pathlib import Path
 import pytest
 import uvicorn.server
 
-from hilbo.app import device_rig, interruptions, runner, serve
-from hilbo.app.device_rig import DeviceRig
-from hilbo.app.hub import Hub
-from hilbo.app.rehearsal import example_sets, fast_study
-from hilbo.app.robot import Client
+from hilbo.app.hub import interruptions, runner
+from hilbo.app.hub.hub import Hub
+from hilbo.app.rehearsal.rehearsal import example_sets, fast_study
+from hilbo.app.rehearsal.robot import Client
+from hilbo.app.rigs import device_rig
+from hilbo.app.rigs.device_rig import DeviceRig
+from hilbo.app.server import serve
 from hilbo.device import protocol
 from hilbo.device.link import Link
 from hilbo.device.ports import BAUD, open_port
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import Renderer, State
-from hilbo.session.event_log import EventLog, read_log
-from hilbo.session.look_ahead import LiveChooser
-from hilbo.session.records import Block, Header, Planned
-from hilbo.session.state import LiveSession
+from hilbo.session.choose.look_ahead import LiveChooser
+from hilbo.session.log.event_log import EventLog, read_log
+from hilbo.session.log.records import Block, Header, Planned
+from hilbo.session.log.state import LiveSession
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from live_server import Live
 
-from hilbo.app.robot import Client
-from hilbo.app.stimulus_rig import StimulusRig
-from hilbo.session.records import Block, Planned
+from hilbo.app.rehearsal.robot import Client
+from hilbo.app.rigs.stimulus_rig import StimulusRig
+from hilbo.session.log.records import Block, Planned
 from hilbo.study.config import Study
 
 __all__ = [

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hilbo import viscoelastic
-from hilbo.app.tried import FIXED, NAMES
+from hilbo.app.server.tried import FIXED, NAMES
 
 __all__ = ["Person"]
 

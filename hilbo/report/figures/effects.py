@@ -8,8 +8,8 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from hilbo.report.figures.style import BLUE, ORANGE, RED, STYLE, label_axes
+from hilbo.study.analysis.effects import Effect
 from hilbo.study.config import Study
-from hilbo.study.effects import Effect
 
 __all__ = ["effects_figure"]
 

@@ -35,10 +35,10 @@ from hilbo.report.figures.style import (
     star,
     title,
 )
+from hilbo.study.analysis.progress import Progress
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.optima import predict_map
-from hilbo.study.progress import Progress
+from hilbo.study.estimate.optimum import predict_map
 
 __all__ = [
     "Slice",

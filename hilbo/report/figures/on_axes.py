@@ -16,9 +16,9 @@ from hilbo.errors import InputError
 from hilbo.ordinal_gp import Posterior
 from hilbo.report.figures.maps import BLUE, STYLE, label_axes, level_words, star
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Aggregate
 from hilbo.study.config import Study
-from hilbo.study.optima import best_point
+from hilbo.study.estimate.aggregate import Aggregate
+from hilbo.study.estimate.optimum import best_point
 
 __all__ = ["draw_map"]
 

@@ -20,10 +20,10 @@ from hilbo.report.figures.style import (
     legend,
 )
 from hilbo.search.apart import nrmse
+from hilbo.study.analysis.cohort_results import CohortResults
+from hilbo.study.analysis.progress import Progress
 from hilbo.study.cohort import Cohort
-from hilbo.study.cohort_results import CohortResults
 from hilbo.study.config import Study
-from hilbo.study.progress import Progress
 
 __all__ = ["individual_convergence", "population_convergence", "progress_figure"]
 

@@ -20,8 +20,8 @@ from hilbo.report.figures.style import (
     star,
     title,
 )
-from hilbo.study.analysis import Reading
-from hilbo.study.map_summary import slice_through
+from hilbo.study.analysis.analysis import Reading
+from hilbo.study.analysis.tolerance import slice_through
 
 __all__ = ["class_regions"]
 

@@ -31,11 +31,11 @@ from hilbo.report.figures.style import (
     title,
 )
 from hilbo.search.apart import nrmse
-from hilbo.study.analysis import Analysis
+from hilbo.study.analysis.analysis import Analysis
+from hilbo.study.analysis.progress import Progress
+from hilbo.study.analysis.tolerance import Sets
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.map_summary import Sets
-from hilbo.study.progress import Progress
 
 __all__ = ["posterior_progress", "sets_on_map", "typical_person"]
 

@@ -1,0 +1,290 @@
+"""What happens next in a session: propose, make ready, lead through the steps, wait for the answer.
+
+One task at a time, begun anew whenever an event changes what is to be felt (an answer, a break, an undo, a HOLD …).
+A rendering is made ready by the rig (`rig`) while the participant feels the reference or nothing, and a step begins
+when the rig says that it shows it. Nothing is shown before Begin, nor while something is compiled; whenever nobody is
+to feel anything the rig is told to rest, whatever it was doing. A hand that keeps a rendering from beginning is asked
+to leave; where it stays, the presentation is interrupted and nothing is forced. While the participant feels, the next
+proposal is made ready for every possible answer, so that after the answer it is only looked up.
+"""
+
+import asyncio
+import contextlib
+import time
+from concurrent.futures import Future
+from typing import Any
+
+from hilbo.app.hub.interruptions import interrupt
+from hilbo.app.interface import Held
+from hilbo.app.rigs.rig import Loaded, MissedError, Showing
+from hilbo.session.log import actions
+from hilbo.session.log.records import Event, RefusedError, Trial
+
+__all__ = ["Runner"]
+
+_LATER = 1.0  # s until what the device refused is tried again
+_SOON = 0.05  # s
+_HAND = 0.15  # s that a hand may keep a rendering from being shown before it is asked to leave
+_LEAVES = 20.0  # s that it may stay after that, until the presentation is interrupted
+
+
+class HandError(RuntimeError):
+    """The hand has not left, and nothing begins under it."""
+
+
+class Runner:
+    """Leads a `Hub` on: `stage` says what it is at, for the views; `ends` when the present step does (monotonic)."""
+
+    def __init__(self, hub: Held):
+        self.hub = hub
+        self.stage, self.trouble = "idle", ""
+        self.step: int | None = None
+        self.ends = 0.0
+        self.clock: dict[str, float] = {}
+        self._task: asyncio.Task | None = None
+        self._stop = asyncio.Event()
+        self._asked: float | None = None  # since when the hand has been asked to leave, monotonic
+        self._in_force: tuple[int, int, str] | None = None
+        self._showing: Showing | None = None  # what was asked for last
+        self._differs = False  # whether what is presented has ever been something else than what was asked for
+        self._wake = asyncio.Event()
+        self._ahead: Future | None = None
+        self.fits_after = 0  # fits that a participant had to wait for
+
+    def key(self) -> tuple:
+        """What is to be felt now: a change begins everything anew."""
+        pending = self.hub.state.pending
+        return self.hub.state.screen, pending and (pending.id, pending.presentation)
+
+    def restart(self) -> None:
+        """Leave what is going on, and begin with what the state says now."""
+        self.cancel()
+        self._stop = asyncio.Event()
+        self._task = asyncio.create_task(self._run(self._stop))
+
+    def cancel(self) -> None:
+        """Leave what is going on."""
+        self._stop.set()
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None
+        self.stage, self.step, self._asked = "idle", None, None
+
+    def wake(self) -> None:
+        """What is waited for may have happened."""
+        self._wake.set()
+
+    def forget(self) -> None:
+        """The rig has no rendering any more."""
+        self._in_force = None
+
+    async def _run(self, stop: asyncio.Event) -> None:
+        """Until there is nothing to do before somebody does something."""
+        try:
+            try:
+                await self._lead()
+            except MissedError as error:
+                await self._missed(str(error))
+                self._again(stop)
+            except HandError as error:
+                await interrupt(self.hub, str(error))
+        except RefusedError:  # the state has changed meanwhile, and with it what is to be done
+            await asyncio.sleep(_SOON)
+            self._again(stop)
+        except Exception as error:  # whatever it is, the experimenter is told, and it is tried again
+            self.trouble = str(error) or type(error).__name__
+            self._at("trouble")
+            await asyncio.sleep(_LATER)
+            self._again(stop)
+
+    async def _lead(self) -> None:
+        hub = self.hub
+        if hub.state.screen not in ("wait", "trial") or not hub.begun:
+            self.clock = {}  # what follows a rest does not follow an answer
+            await hub.rig.rest()
+        while hub.state.screen in ("wait", "trial"):
+            if hub.state.screen == "wait":
+                self._at("choosing")
+                await self._propose()
+            else:
+                trial = hub.state.pending
+                assert trial is not None  # as the screen says
+                await self._present(trial)
+                return
+        self._at("idle")
+
+    def _again(self, stop) -> None:
+        if not stop.is_set():
+            asyncio.get_running_loop().call_soon(self.restart)
+
+    def _at(self, stage: str, step: int | None = None, seconds: float = 0.0) -> None:
+        self.stage, self.step, self.ends = stage, step, time.monotonic() + seconds
+        if stage != "trouble":
+            self.trouble = ""
+        self.hub.publish()
+
+    async def _propose(self) -> None:
+        """The next trial, in the log; chosen in the choosing's thread."""
+        hub = self.hub
+        state = hub.state
+        loop = asyncio.get_running_loop()
+        begun, fits = time.perf_counter(), getattr(hub.chooser, "fits", 0)
+        event = await loop.run_in_executor(hub.compute, actions.propose, state, hub.chooser, time.time())
+        if "came" in self.clock:
+            self.fits_after += getattr(hub.chooser, "fits", 0) - fits
+
+        def make(newest, at):
+            if newest.seq == event.seq - 1:
+                return event
+            if newest.need != state.need or newest.trials != state.trials:
+                raise RefusedError("nothing", "what is to be proposed has changed.")
+            return Event(seq=newest.seq + 1, kind=event.kind, time=at, data=event.data)
+
+        self.clock["chosen"] = time.perf_counter() - begun
+        await hub.commit(make, mine=True)
+        self.clock["proposed"] = time.perf_counter()
+
+    async def _present(self, trial: Trial) -> None:
+        hub = self.hub
+        if (
+            trial.step is not None and not trial.unfinished
+        ):  # all felt already: after a break, or a restart of the server
+            self._look_ahead()
+            self._at("answer")
+            return
+        steps = hub.state.steps_of(trial)
+        await hub.rig.blank()
+        await self._rig_ready()
+        loading = self._loading(trial, _next_side(steps, 0))
+        try:
+            await asyncio.shield(hub.warm)  # a long arithmetic start, and a device that renders, do not go together
+            while not hub.begun:
+                self._wake.clear()
+                self._at("hello")
+                await self._wake.wait()
+            if not self._differs:
+                self._look_ahead()
+            if hub.gap and trial.id > 1:
+                self._at("between")
+                await asyncio.sleep(hub.gap)
+            for i, (show, seconds) in enumerate(steps):
+                if show in trial.renderings:
+                    await self._untouched(loading)
+                elif i and loading.done():
+                    loading = self._loading(trial, _next_side(steps, i))
+                await self._step(trial, i, show, seconds)
+            await hub.rig.blank()
+        finally:
+            loading.cancel()
+        self._at("answer")
+
+    async def _step(self, trial, i, show, seconds) -> None:
+        commit = self.hub.commit
+        self._showing = self._showing_of(trial, i, show)
+        shown = asyncio.ensure_future(self.hub.rig.show(self._showing))
+        try:
+            loaded = await self._untouched(shown)
+        finally:
+            shown.cancel()
+        self._asked = None
+        if loaded is not None:
+            await self._in_log(trial, show, loaded)
+        await commit(lambda state, at: actions.present(state, trial.id, i, True, at), mine=True)
+        self._at("step", i, seconds)
+        await asyncio.sleep(seconds)
+        await commit(lambda state, at: actions.present(state, trial.id, i, False, at), mine=True)
+
+    async def _untouched(self, work: asyncio.Future) -> Any:
+        """The result of what waits until no hand touches the rig; a hand that stays is asked to leave. Raises
+        `HandError` once it has been asked for so long."""
+        wait = _HAND
+        while not (await asyncio.wait([work], timeout=wait))[0]:
+            touched, now = self.hub.rig.snapshot.contact, time.monotonic()
+            self._asked = (self._asked or now) if touched else None
+            if self._asked is not None and now - self._asked > _LEAVES:
+                raise HandError(
+                    f"The participant did not release the device within {_LEAVES:g} s; the trial restarts after Begin"
+                    " is pressed."
+                )
+            stage = "let-go" if touched else "showing"
+            if self.stage != stage:
+                self._at(stage)
+            wait = _SOON
+        return await work
+
+    def _loading(self, trial, side) -> asyncio.Task:
+        """`_load`, going on beside what the participant feels."""
+        task = asyncio.ensure_future(self._load(trial, side))
+        task.add_done_callback(_looked_at)
+        return task
+
+    async def _load(self, trial: Trial, side: str | None) -> None:
+        """A side made ready, and in the log if it is in force by that."""
+        if side is None or self._in_force == (trial.id, trial.presentation, side):
+            return
+        self._in_force = None  # nobody knows which, until this one is known to be
+        showing = self._showing_of(trial, 0, side)
+        loaded = await self.hub.rig.prepare(showing)
+        if loaded is not None:
+            await self._in_log(trial, side, loaded)
+            self._in_force = (trial.id, trial.presentation, side)
+
+    async def _in_log(self, trial: Trial, side: str, loaded: Loaded) -> None:
+        """In the log that a side is in force; what is presented may be another rendering than the one asked for."""
+        self._note_times(loaded)
+        await self.hub.commit(lambda state, at: actions.sent(state, trial.id, side, at, **loaded.facts), mine=True)
+        now = self.hub.state.trial(trial.id)
+        self._differs = self._differs or now.presented != now.renderings
+        if self._differs:
+            self._look_ahead()
+
+    def _showing_of(self, trial: Trial, step: int, show: Any) -> Showing:
+        material = self.hub.state.header.blocks[trial.block].material
+        return Showing(trial.id, trial.presentation, step, show, trial.renderings.get(show), material)
+
+    async def _missed(self, why: str) -> None:
+        """What was not presented voids its trial; nothing goes on by itself."""
+        hub, showing = self.hub, self._showing
+        assert showing is not None  # only a step can be missed
+        with contextlib.suppress(RefusedError):
+            await hub.commit(lambda state, at: actions.missed(state, showing.trial, showing.show, why, at), mine=True)
+        hub.begun = False
+
+    def _note_times(self, loaded) -> None:
+        """How long it took from an answer to parameters in force, in parts."""
+        clock, now = self.clock, time.perf_counter()
+        if {"came", "chosen", "proposed"} <= set(clock):
+            parts = {"total": now - clock["came"], "fsync": clock["fsync"], "chosen": clock["chosen"]}
+            self.hub.delays.append(parts | {"serial": loaded.took_s, "acknowledged": clock["logged"] - clock["came"]})
+        self.clock = {}
+
+    async def _rig_ready(self) -> None:
+        """Wait while the rig is lost, or holds."""
+        while True:
+            seen = self.hub.rig.snapshot
+            if seen.lost is None and seen.state not in ("HOLD", "ESTOP"):
+                return
+            self.clock = {}
+            why = f": {seen.reason}" if seen.reason else ""
+            self.trouble = seen.lost or f"The {self.hub.rig.title.lower()} is in {seen.state}{why}."
+            self._at("trouble")
+            self._wake.clear()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), _LATER)
+
+    def _look_ahead(self) -> None:
+        """In the choosing's thread, while somebody feels: what comes next after each possible answer. It ends with the
+        answer: what follows is chosen in the same thread."""
+        hub = self.hub
+        state, key = hub.state, self.key()
+        self._ahead = hub.compute.submit(hub.chooser.lookahead, state, lambda: self.key() == key)
+
+
+def _next_side(steps, i) -> str | None:
+    return next((show for show, _ in steps[i:] if show in ("a", "b")), None)
+
+
+def _looked_at(done) -> None:
+    """Its exception counts as seen, also where nobody waits for it."""
+    if not done.cancelled():
+        done.exception()

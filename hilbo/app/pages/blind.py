@@ -1,0 +1,73 @@
+"""What an experimenter is told who is not to know the parameters: how far the session is, the answers, and labels.
+
+Made of what is known to hold no parameter, never by leaving something out: names of sets, choices, predictions, what
+was confirmed and reasons that state values are not in it. A label (`set_codes.label_of`) stands for each rendering, the
+same that the preparer sees.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from hilbo.app.interface import Held
+from hilbo.app.pages import log_words
+from hilbo.session.log.records import Event, Trial
+from hilbo.session.plan.set_codes import label_of
+
+__all__ = ["experimenter"]
+
+_SAME = (
+    *("who", "what", "banners", "phase", "phase_words", "alert", "may", "means", "participant_here", "all_delays"),
+    "fits_after_an_answer",
+)
+_WHOLE = ("study", "screen", "seq", "block", "pending", "paused", "aborted", "notes", "began", "last", "participant")
+_TRIAL = ("id", "phase", "number", "status", "presentation", "step", "values", "answered")
+_BANNER = "Blind: this page shows no parameter; labels stand for what is presented"
+
+
+def experimenter(hub: Held, seen: Mapping[str, Any]) -> dict[str, Any]:
+    """The view, of what the experimenter would see who knows all."""
+    state, trial = hub.state, hub.state.pending
+    blocks = seen["trial"][: len(state.header.blocks)]
+    labels = [[f"Rendering {side.upper()}", label] for side, label in _labels(hub, trial).items()]
+    whole = {key: seen["whole"][key] for key in _WHOLE}
+    whole["trials"] = [{key: one[key] for key in _TRIAL if key in one} for one in seen["whole"]["trials"]]
+    return {key: seen[key] for key in _SAME} | {
+        "banners": [*seen["banners"], _BANNER],
+        "trial": [*blocks, *labels],
+        "device": seen["device"] | {"rows": [row for row in seen["device"]["rows"] if row[0] != "Refused"]},
+        "trust": [],
+        "table": _table(hub, seen["table"]["rows"]),
+        "log": [log_words.line(state, _unvalued(event)) for event in list(hub.recent)[:60]],
+        "map_version": "",
+        "whole": whole,
+    }
+
+
+def _labels(hub: Held, trial: Trial | None) -> dict[str, str]:
+    """Side -> label."""
+    return {} if trial is None else {side: label_of(values, hub.tag) for side, values in trial.renderings.items()}
+
+
+def _table(hub: Held, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The trials, the newest first, with labels in the place of values and of names of sets."""
+    labelled = []
+    for trial, row in zip(reversed(hub.state.trials), rows, strict=True):
+        place, answer, remark = row["cells"][:3]
+        remark = _first_words(remark) if trial.voided and trial.voided.get("by") == "rule" else remark
+        labelled.append(row | {"cells": [place, answer, remark, " / ".join(_labels(hub, trial).values())]})
+    return {"head": ["trial", "answer", "remark", "label"], "rows": labelled}
+
+
+def _unvalued(event: Event) -> Event:
+    """The event without what may state a value, or a set's name."""
+    data = {key: value for key, value in event.data.items() if key not in ("sets", "choice")}
+    if event.kind == "missed":
+        data["reason"] = str(data["reason"]).partition(":")[0]
+    return msgspec.structs.replace(event, data=data)
+
+
+def _first_words(remark: str) -> str:
+    """`void: stimulus: off`, of a longer reason."""
+    return ":".join(remark.split(":")[:3])

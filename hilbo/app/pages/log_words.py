@@ -1,0 +1,168 @@
+"""The log's events as sentences, and the trials as rows, for the experimenter's page."""
+
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from typing import Any
+
+from hilbo.session.log.actions import restorable
+from hilbo.session.log.records import Event, Trial
+from hilbo.session.log.state import LiveSession
+from hilbo.study.file.trial_flags import FLAGS, SAMPLES
+
+__all__ = ["line", "meant", "place_of", "sentence", "table"]
+
+_SHOWN = {"reference": "the reference", "a": "rendering A", "b": "rendering B", "neutral": "nothing"}
+_WHO = {"stimulus": "The program that presents", "preparer": "The preparer"}
+_DEVICE = {"ready": "is ready", "running": "renders", "stopped": "is at rest", "hold": "holds", "estop": "was stopped"}
+
+
+def place_of(trial: Trial) -> str:
+    """What a trial is called on the experimenter's page: the letter of its phase and its number."""
+    return trial.data["phase"][0].upper() + str(trial.number)
+
+
+def meant(trial: Trial | None) -> dict[str, Any] | None:
+    """A trial as a command names it."""
+    return None if trial is None else {"trial": trial.id, "name": place_of(trial)}
+
+
+def line(state: LiveSession, event: Event) -> list[str]:
+    """An event's number, time of day, and sentence."""
+    at = datetime.fromtimestamp(event.time).strftime("%H:%M:%S")
+    return [str(event.seq), at, sentence(state, event)]
+
+
+def sentence(state: LiveSession, event: Event) -> str:
+    """What happened; `state` is one after the event."""
+    data = event.data
+    trial = data.get("id", data.get("trial") if event.kind == "device" else None)
+    name = "" if trial is None else place_of(state.trial(trial))
+    if event.kind == "repeat":
+        return _repeated(state.trial(data["id"]), name, event.seq)
+    return _SENTENCES[event.kind](state, name, data)
+
+
+def _because(data: Mapping[str, Any]) -> str:
+    """A reason after a colon, and the end of the sentence."""
+    reason = str(data.get("reason", "")).strip().rstrip(".")
+    return f": {reason}." if reason else "."
+
+
+def _proposed(_state, name, data):
+    sets = " and ".join(data.get("sets", {}).values())
+    if data["repeats"] is not None:
+        return f"{name} comes next: a repetition, as a check of consistency."
+    by = data.get("choice", {}).get("by")
+    why = f": {sets}, as planned" if sets else f", chosen by {'UCB' if by == 'ucb' else by}" if by else ""
+    return f"{name} comes next{why}."
+
+
+def _presented(_state, name, data):
+    shown = _SHOWN[data["show"]]
+    if data["show"] == "neutral":
+        return f"{name}: a neutral interval {'begins' if data['on'] else 'ends'}."
+    return f"{name}: {shown} {'is presented' if data['on'] else 'ends'}."
+
+
+def _answered(_state, name, data):
+    values, took = data["values"], data["browser"].get("response_s")
+    classes = {side: values[f"class_{side}"] for side in "ab" if f"class_{side}" in values}
+    words = list(classes.values()) if len(values) == 1 else [f"{s.upper()} {c}" for s, c in classes.items()]
+    words += [f"{values['preferred'].upper()} preferred"] if "preferred" in values else []
+    after = "" if took is None else f" after {took:.1f} s"
+    return f"{name} is answered{after}: {', '.join(words)}.{_flags(data.get('telemetry'))}"
+
+
+def _flags(telemetry: Mapping[str, int] | None) -> str:
+    """How many samples of a trial the device flagged, as a sentence after another; empty where it flagged none."""
+    if telemetry is None or set(telemetry) == {SAMPLES}:
+        return ""
+    words = ", ".join(f"{name.replace('_', ' ')} {telemetry[name]}" for name in FLAGS if name in telemetry)
+    return f" Flagged of {telemetry[SAMPLES]} samples: {words}."
+
+
+def _repeated(trial, name, seq):
+    answered = trial.answered is not None and trial.answered["seq"] < seq
+    return f"{name} will be asked once more, later." if answered else f"{name} begins again from its first step."
+
+
+def _device(state, name, data):
+    stimulus = state.study.stimulus
+    who = "The device" if stimulus is None else _WHO[stimulus.role]
+    condition = data["condition"]
+    reason = str(data.get("reason", ""))
+    if condition == "lost":
+        return f"{who} is lost{_because(data)}"
+    words = f"{who} {_DEVICE[condition]}{_because({'reason': reason})}"
+    voided = state.trial(data["trial"]).voided if condition in ("hold", "estop") and name else None
+    return f"{words} {name} is void." if voided and voided["by"] == "rule" else words
+
+
+_SENTENCES: dict[str, Callable[[LiveSession, str, Mapping[str, Any]], str]] = {
+    "propose": _proposed,
+    "sent": lambda _, name, data: f"{name}: {_SHOWN[data['side']]} is in force.",
+    "stimulus": _presented,
+    "missed": lambda _, name, data: f"{name} is void, {_SHOWN[data['show']]} was not presented{_because(data)}",
+    "answer": _answered,
+    "undo": lambda _, name, data: f"The answer to {name} is taken back{_because(data)}",
+    "void": lambda _, name, data: f"{name} is made void{_because(data)}",
+    "restore": lambda _, name, data: f"The answer to {name} counts again.",
+    "skip": lambda _, name, data: f"{name} is left out{_because(data)}",
+    "pause": lambda _, name, data: f"A break, asked for by the {data['by']}.",
+    "resume": lambda _, name, data: "The break is over.",
+    "abort": lambda _, name, data: f"The session is ended early{_because(data)}",
+    "note": lambda _, name, data: f"Note: {data['text']}",
+    "more": lambda _, name, data: "The participant wants another rendering of the warm-up.",
+    "go_on": lambda _, name, data: "The next part begins.",
+    "device": _device,
+}
+
+
+def table(state: LiveSession) -> dict[str, Any]:
+    """The trials, the newest first: the answer, what is to be known of it, and what was presented: the sets' names
+    where all were planned, the parameters where some were chosen."""
+    parameters = state.study.space.parameters
+    chosen = any(not trial.sets for trial in state.trials)
+    heads = [f"{p.name} ({p.unit})" if p.unit else p.name for p in parameters] if chosen else ["sets"]
+    return {
+        "head": ["trial", "answer", "remark", *heads],
+        "rows": [_row(state, trial, chosen) for trial in reversed(state.trials)],
+    }
+
+
+def _row(state: LiveSession, trial: Trial, chosen: bool) -> dict[str, Any]:
+    """`kind` is now, voided, repeated or ""; `restore` names a voided answer that may be restored."""
+    shown = _values(state, trial) if chosen else [" / ".join(trial.sets.values())]
+    answer, remark = " ".join((trial.values or {}).values()), _remark(state, trial)
+    discarded = trial.status not in ("pending", "answered")
+    kind = "voided" if discarded else "now" if trial.status == "pending" else "repeated" if remark else ""
+    flags = [name.replace("_", " ") for name in FLAGS if name in (trial.telemetry or {})]
+    remarks = "; ".join([remark] * bool(remark) + flags)
+    row = {"kind": kind, "cells": [place_of(trial), answer, remarks, *shown]}
+    voided = trial.status == "void" and trial.values is not None
+    return row | ({"restore": meant(trial)} if voided and restorable(state, trial.id) else {})
+
+
+def _values(state: LiveSession, trial: Trial) -> list[Any]:
+    """What was presented, a value for each parameter; of two renderings both in one text."""
+    parameters, both = state.study.space.parameters, list(trial.presented.values())
+    if len(both) > 1:
+        return [" / ".join(p.words(values[p.name]) for values in both) for p in parameters]
+    return [p.shown(both[0][p.name]) if p.levels else both[0][p.name] for p in parameters]
+
+
+def _remark(state: LiveSession, trial: Trial) -> str:
+    """Whether it does not count, and why; and how often it was presented."""
+    reason = str((trial.voided or {}).get("reason", ""))
+    status = {
+        "void": "void",
+        "left out": "left out",
+        "undone": "answer taken back",
+        "dropped": "not asked: an earlier answer changed",
+        "pending": "now",
+    }.get(trial.status)
+    words = [f"{status}: {reason}" if status and reason else status] if status else []
+    words += [f"repeats {place_of(state.trial(trial.repeats))}"] if trial.repeats is not None else []
+    words += [f"presented {trial.presentation} times"] if trial.presentation > 1 else []
+    words += ["to be repeated"] if trial.id in state.wanted else []
+    return "; ".join(words)

@@ -1,0 +1,162 @@
+"""What participant and experimenter are shown of a session, as plain dicts for JSON.
+
+The participant's holds no parameter, no name of a set and no prediction: it is made from the protocol and its texts,
+never by leaving something out of the experimenter's.
+"""
+
+from typing import Any
+
+import msgspec
+
+from hilbo.session.log.records import Trial
+from hilbo.session.log.state import LiveSession
+from hilbo.study.file.languages import language
+from hilbo.study.file.protocols import protocol
+
+__all__ = ["experimenter_view", "participant_view"]
+
+_SCREEN_TEXT = {
+    "wait": "wait",
+    "trial": "wait",
+    "ready": "ready",
+    "rest": "rest",
+    "paused": "paused",
+    "done": "done",
+    "ended": "ended",
+}
+
+
+def participant_view(state: LiveSession) -> dict[str, Any]:
+    """What the participant's page is told; nothing else of a session may reach their browser.
+
+    `screen` and its `message`; `trial` (id, presentation, steps with their texts and seconds, the running `step`,
+    `felt`, `asks`) or None; `progress` (done, of, text); `may` (which buttons); `texts`.
+    """
+    session = state.study.session
+    trial = state.pending if state.screen in ("trial", "paused") else None
+    return {
+        "screen": state.screen,
+        "message": session.text(_SCREEN_TEXT[state.screen]),
+        "trial": None if trial is None else _shown_trial(state, trial),
+        "progress": _progress(state),
+        "rest": state.header.blocks[state.block].rest if state.screen == "rest" and state.block is not None else None,
+        "may": {
+            "break": state.screen in ("trial", "wait", "ready"),
+            "another": state.screen == "ready" and _spare(state),
+            "go_on": state.screen == "ready",
+        },
+        "texts": {key: session.text(key) for key in language("en").texts},
+    }
+
+
+def _spare(state):
+    before = state.block - 1
+    return state.quota(before) < len(state.header.blocks[before].trials)
+
+
+def _shown_trial(state, trial: Trial):
+    session = state.study.session
+    asks = protocol(session, state.header.blocks[trial.block].phase).asks
+    alone = "b" not in trial.renderings
+    return {
+        "id": trial.id,
+        "presentation": trial.presentation,
+        "again": trial.presentation > 1,
+        "steps": [
+            {"show": show, "seconds": seconds, "text": session.text(_step_text(show, alone))}
+            for show, seconds in state.steps_of(trial)
+        ],
+        "step": trial.step,
+        "felt": trial.felt == frozenset(trial.renderings),
+        "asks": [_ask(state, ask, alone) for ask in asks],
+    }
+
+
+def _step_text(show, alone):
+    if show == "neutral":
+        return "neutral"
+    return "feel_test" if alone and show == "a" else f"feel_{show}"
+
+
+def _ask(state, ask, alone):
+    session = state.study.session
+    if ask == "preferred":
+        choices = [{"value": side, "label": session.text(side), "definition": ""} for side in ("a", "b")]
+        return {"name": ask, "question": session.text("question_preferred"), "choices": choices}
+    key = "question" if alone else f"question_{ask[-1]}"
+    choices = [
+        {"value": label, "label": session.label(label), "definition": session.definition(label)}
+        for label in state.study.responses
+    ]
+    return {"name": ask, "question": session.text(key), "choices": choices}
+
+
+def _progress(state):
+    """Answers of the present part, out of how many; of the last one at the end. In words the trial, from 1."""
+    block = len(state.header.blocks) - 1 if state.block is None else state.block
+    if state.pending is not None:
+        block = state.pending.block
+    elif state.screen == "ready":
+        block -= 1
+    done, of = len(state.answers(block)), state.quota(block)
+    numbers = {"{trial}": min(done + 1, of), "{done}": done, "{of}": of}
+    text = state.study.session.text("progress")
+    for name, number in numbers.items():
+        text = text.replace(name, str(number))
+    return {"done": done, "of": of, "warm_up": state.header.blocks[block].phase == "warm-up", "text": text}
+
+
+def experimenter_view(state: LiveSession) -> dict[str, Any]:
+    """Everything there is to see."""
+    header = state.header
+    return {
+        "study": {"name": state.study.name, "hash": state.study.hash, "responses": list(state.study.responses)},
+        "header": msgspec.to_builtins(header),
+        "screen": state.screen,
+        "seq": state.seq,
+        "block": state.block,
+        "blocks": [
+            {
+                "phase": block.phase,
+                "material": block.material,
+                "done": len(state.answers(i)),
+                "of": state.quota(i),
+                "skipped": [msgspec.to_builtins(block.trials[k]) for k in state.skipped(i)],
+                "put_off": [_put_off(state, i, k) for k in state.put_off(i)],
+                "excluded": state.excluded(i),
+            }
+            for i, block in enumerate(header.blocks)
+        ],
+        "pending": None if state.pending is None else state.pending.id,
+        "trials": [_whole_trial(state, trial) for trial in state.trials],
+        "paused": state.paused,
+        "aborted": state.aborted,
+        "device": dict(state.machine),
+        "notes": [{"time": at, "text": text} for at, text in state.notes],
+        "began": state.began,
+        "last": state.last,
+        "participant": participant_view(state),
+    }
+
+
+def _put_off(state, block, k):
+    """A planned trial that comes last, and how often the device stopped it."""
+    return msgspec.to_builtins(state.header.blocks[block].trials[k]) | {"stops": state.stops(block)[k]}
+
+
+def _whole_trial(state, trial: Trial):
+    return {
+        **trial.data,
+        "status": trial.status,
+        "presentation": trial.presentation,
+        "proposed": trial.proposed,
+        "steps": state.steps_of(trial),
+        "step": trial.step,
+        "on": trial.on,
+        "sent": dict(trial.sent),
+        "presented": trial.presented,
+        "values": trial.values,
+        "answered": trial.answered,
+        "telemetry": trial.telemetry,
+        "voided": trial.voided,
+    }

@@ -1,0 +1,163 @@
+"""Slices of the posterior mean through its maximum, for the experimenter's page; one compiled function.
+
+There is one for each pair of parameters. Of a single parameter there is one, with the answers up.
+"""
+
+import itertools
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import Posterior
+from hilbo.search.apart import differences
+from hilbo.search.box import Parameter
+from hilbo.session.choose import progress
+from hilbo.session.choose.look_ahead import Answers, LiveChooser
+from hilbo.session.log.state import LiveSession
+from hilbo.study.config import Study
+
+__all__ = ["Maps"]
+
+_SIDE = 33
+_ANSWER = "answer given"  # what is up where there is one parameter
+_Pair = tuple[int, int | None]  # of parameters, across and up
+
+
+class Maps:
+    """Makes the slices of a session's map, material by material, from the posteriors that its chooser keeps."""
+
+    def __init__(self, chooser: LiveChooser):
+        self._chooser = chooser
+
+    def warm(self) -> None:
+        """Compile what `slices` and `trust` need, with no answers."""
+        for block in self._chooser.chosen_blocks:
+            fitted, study = self._chooser.fitted(Answers(block)), self._chooser.study(block)
+            self._sliced(Answers(block), None)
+            following = [fitted] * len(study.responses)
+            progress.trust(study, fitted, fitted.point, following, lambda one, of=block: self._chooser.best(of, one))
+
+    def trust(self, state: LiveSession) -> list[list[str]]:
+        """How far the session has come, in words: name and value."""
+        rows = []
+        chosen = [i for i in self._chooser.chosen_blocks if state.answers(i)]
+        block = next((i for i in chosen if not state.full(i)), chosen[-1] if chosen else None)
+        trust = None if block is None else progress.trust_of(state, block, self._chooser)
+        if trust is not None:
+            parameters = ((p, trust.best[p.name]) for p in state.study.space.parameters)
+            named = (f"{p.name} {p.words(value) if p.levels else f'{value:.3g}'}" for p, value in parameters)
+            rows.append(["Best so far", ", ".join(named)])
+            top = state.study.responses[-1]
+            rows.append([f'… would be "{top}"', f"{100 * trust.top:.0f} %"])
+            if trust.movement is not None:
+                rows.append(["… moves with one more", f"by {100 * trust.movement:.1f} % of the ranges"])
+        twice = progress.consistency(state)
+        if twice.pairs:
+            rows.append(["Asked twice", f"{twice.alike} of {twice.pairs} alike"])
+        return rows
+
+    def slices(self, state: LiveSession) -> dict[str, Any] | None:
+        """For each pair of parameters, or the one: mean on a grid (row by row, None where not feasible), the maximum,
+        and the trials with their distance from the slice; and the parameters' ranges. None where the session chooses
+        nothing, no slices before there is an answer."""
+        blocks = self._chooser.chosen_blocks
+        if not blocks:
+            return None
+        trial = state.pending
+        block = trial.block if trial is not None and trial.block in blocks else blocks[0]
+        asked = None if trial is None or trial.sets else trial.presented["a"]
+        answers = Answers.of(state, block)
+        slices = self._sliced(answers, asked) if answers.categories else []
+        parameters = self._chooser.study(block).space.parameters
+        ranges = {
+            p.name: {"unit": p.unit, "scale": p.scale, "low": p.low, "high": p.high, "levels": p.levels}
+            for p in parameters
+        }
+        if len(parameters) == 1:
+            ranges[_ANSWER] = {"unit": "", "scale": "linear", "low": 0, "high": 1, "levels": state.study.responses}
+        return {"slices": slices, "ranges": ranges}
+
+    def _sliced(self, answers: Answers, asked: Mapping[str, float] | None) -> list[dict[str, Any]]:
+        """`slices` after some answers; `asked`: the rendering that is being felt."""
+        study, fitted = self._chooser.study(answers.block), self._chooser.fitted(answers)
+        names = study.space.names
+        best = self._chooser.best(answers.block, fitted)
+        maps: _Slices = jax.device_get(_slices(study, fitted.posterior, best))
+        marks = np.asarray(fitted.posterior.trials.x)[: len(answers.categories)]
+        levels = np.array(answers.categories, int) / (len(study.responses) - 1)
+        felt = None if asked is None else np.asarray(study.space.to_unit(np.array([asked[name] for name in names])))
+        pairs = enumerate(_pairs(len(names)))
+        return [_slice(study, maps, k, pair, marks, levels, felt) for k, pair in pairs]
+
+
+def _pairs(dim: int) -> list[_Pair]:
+    """The parameters across and up of each slice; a single one has nothing up."""
+    return [*itertools.combinations(range(dim), 2)] or [(0, None)]
+
+
+class _Slices(NamedTuple):
+    """The best point of the unit cube, and the posterior mean and what is feasible on the grids through it."""
+
+    best: Float[Array, " d"]
+    mean: Float[Array, "pairs side side"]
+    feasible: Bool[Array, "pairs side side"]
+
+
+def _slice(study, maps: _Slices, k: int, pair: _Pair, marks, levels, felt) -> dict[str, Any]:
+    """One grid, for the page; `marks` (n, d) and `levels` (n,) are the answers, `felt` (d,) what is being felt."""
+    best, names = maps.best, study.space.names
+    others = [i for i in range(len(names)) if i not in pair]
+    held = [_held(study.space.parameters[i], float(best[i])) for i in others]
+    across, up = pair
+    trials = [
+        {"x": float(x[across]), "y": float(level if up is None else x[up]), "level": float(level), "now": False,
+         "away": float(np.linalg.norm(differences(study.gp.kernel.levels, x, best)[others]) / 0.35)}
+        for x, level in zip(marks, levels, strict=True)
+    ]  # fmt: skip
+    if felt is not None:
+        y = 0.5 if up is None else float(felt[up])
+        trials.append({"x": float(felt[across]), "y": y, "level": 0.0, "now": True, "away": 0.0})
+    shown = [
+        [round(float(v), 4) if ok else None for v, ok in zip(row, oks, strict=True)]
+        for row, oks in zip(maps.mean[k], maps.feasible[k], strict=True)
+    ]
+    return {
+        "across": names[across],
+        "up": _ANSWER if up is None else names[up],
+        "held": ", ".join(held),
+        "best": [float(best[across]), 1.0 if up is None else float(best[up])],
+        "mean": shown,
+        "trials": trials,
+    }
+
+
+def _held(parameter: Parameter, unit: float) -> str:
+    value = float(parameter.to_physical(np.asarray(unit)))
+    return f"{parameter.name} = {parameter.words(value) if parameter.levels else f'{value:.3g}'}"
+
+
+def _axis(parameter: Parameter) -> Float[np.ndarray, " side"]:
+    """Where an axis of the grids is, in the unit cube: of levels bands of one width."""
+    count = len(parameter.levels)
+    if not count:
+        return np.linspace(0.0, 1.0, _SIDE)
+    return np.floor((np.arange(_SIDE) + 0.5) * count / _SIDE) / (count - 1)
+
+
+@program
+def _slices(study: Study, posterior: Posterior, physical: Float[Array | np.ndarray, " d"]) -> _Slices:
+    best = study.space.to_unit(physical)
+    axes = [jnp.asarray(_axis(p), best.dtype) for p in study.space.parameters]
+    grids = []
+    for i, j in _pairs(study.space.dim):
+        up, across = jnp.meshgrid(axes[i if j is None else j], axes[i], indexing="ij")
+        grid = jnp.broadcast_to(best, (_SIDE * _SIDE, best.shape[0])).at[:, i].set(across.ravel())
+        grids.append(grid if j is None else grid.at[:, j].set(up.ravel()))
+    points = jnp.concatenate(grids)
+    shape = (len(grids), _SIDE, _SIDE)
+    return _Slices(best, posterior.mean(points).reshape(shape), study.space.feasible(points).reshape(shape))

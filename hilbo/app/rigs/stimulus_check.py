@@ -1,0 +1,98 @@
+"""Is a program ready to present? It is asked for renderings and stopped in them, by the server and rig of a session,
+without a participant, an experimenter or a log.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from hilbo.app.rigs.rig import Showing
+from hilbo.app.rigs.stimulus_rig import StimulusRig
+from hilbo.app.wire.watchers import Watchers
+from hilbo.errors import InputError
+from hilbo.study.file.reading import AnyStudy
+
+__all__ = ["Measured", "StimulusCheck"]
+
+_OFTEN = 5  # renderings, and stops in them
+
+
+class Measured(NamedTuple):
+    """What the program said of itself, and how long it took: s until a rendering was confirmed, and until a stop was
+    acknowledged, each time; `why` it went wrong, or ""."""
+
+    words: str
+    presented: tuple[float, ...]
+    stopped: tuple[float, ...]
+    why: str
+
+
+class StimulusCheck:
+    """In the place of a hub, for `serve`. It waits `patience` s for the program; `done` is called in the end, once
+    `measured` is there."""
+
+    def __init__(self, study: AnyStudy, patience: float):
+        self.rig = StimulusRig(study, "check")
+        self.watchers = Watchers(lambda: "")
+        self.measured: Measured | None = None
+        self._study, self._patience = study, patience
+        self._done: Callable[[], Any] = lambda: None
+        self._task: asyncio.Task | None = None
+
+    def begin(self, done: Callable[[], Any]) -> None:
+        """What `serve` calls when it listens."""
+        self._done = done
+        self._task = asyncio.get_running_loop().create_task(self._measure())
+
+    async def open(self) -> None:
+        """Nothing is to be opened."""
+
+    async def close(self) -> None:
+        """Measure no more."""
+        if self._task is not None:
+            self._task.cancel()
+
+    def text(self, key: str) -> str:
+        """What participants read, in the study's language."""
+        return self._study.session.text(key)
+
+    def hang_up(self) -> None:
+        """Let nobody wait."""
+        self.rig.hang_up()
+
+    async def _measure(self) -> None:
+        presented: list[float] = []
+        stopped: list[float] = []
+        why = ""
+        try:
+            await self._joined()
+            for number in range(_OFTEN):
+                presented.append(await self._timed(self.rig.show(self._middle(number))))
+                stopped.append(await self._timed(self.rig.estop()))
+                await self.rig.clear()
+        except (RuntimeError, InputError) as error:
+            why = str(error)
+        self.measured = Measured(self.rig.words, tuple(presented), tuple(stopped), why)
+        await asyncio.sleep(0.1)  # so that the program hears the last order
+        self._done()
+
+    async def _joined(self) -> None:
+        """The program is there, and has stopped once. Raises RuntimeError where nobody comes."""
+        end = time.monotonic() + self._patience
+        while self.rig.snapshot.lost:
+            if time.monotonic() > end:
+                raise RuntimeError(self.rig.snapshot.lost)
+            await asyncio.sleep(0.02)
+
+    def _middle(self, number: int) -> Showing:
+        """The middle of all ranges."""
+        middles = ((p, (p.low + p.high) / 2) for p in self._study.space.parameters)
+        values = {p.name: float(round(middle)) if p.discrete else middle for p, middle in middles}
+        return Showing(number + 1, 1, 0, "a", values, None)
+
+    @staticmethod
+    async def _timed(work: Any) -> float:
+        begun = time.perf_counter()
+        await work
+        return time.perf_counter() - begun

@@ -1,0 +1,196 @@
+"""Starting and ending the server of a session: address, links, QR codes, signals.
+
+The socket is bound before anything slow happens, so that a port in use is said at once; nobody is answered before the
+hub is open.
+"""
+
+import asyncio
+import base64
+import contextlib
+import functools
+import io
+import socket
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from hilbo.app.wire.security import Gate, Role, lan_addresses
+from hilbo.errors import InputError
+
+__all__ = ["PORT", "Place", "bound", "qr_image", "qr_text", "serve"]
+
+PORT = 8642
+_LINGER = 3  # s for what is still being answered when the server ends
+_FILES = 512 if sys.platform == "win32" else 1024  # open files that are asked for: select() knows no more
+_SWITCH = 0.0005  # s until the busy event loop lets another thread go on: a stop passes through three of them
+_RESERVED = 160  # of them for connections that are served, the device, the log
+
+
+class Place:
+    """Where a session is served: a bound socket, its gate, and links to hand out."""
+
+    def __init__(self, listening: socket.socket, addresses: list[str], keys: Path | None):
+        number = listening.getsockname()[1]
+        self.socket = listening
+        self.hosts = [f"{host}:{number}" for host in ("127.0.0.1", "localhost", *addresses)]
+        self._near, self._far = self.hosts[0], self.hosts[2] if addresses else self.hosts[0]
+        self.gate = Gate(self.hosts, keys)
+
+    def link(self, role: Role) -> str:
+        """A one-time link for a role. The experimenter's is for this computer, the others' for the network where there
+        is one."""
+        host = self._near if role == "experimenter" else self._far
+        return f"http://{host}/#{self.gate.invite(role)}"
+
+    def links(self, roles: Iterable[Role] = ("participant", "experimenter")) -> dict[str, str]:
+        """One link for each of the roles."""
+        return {role: self.link(role) for role in roles}
+
+
+def bound(port: int = PORT, *, lan: bool = False, keys: Path | None = None) -> Place:
+    """A socket that nobody else uses. Only this computer reaches it, with `lan` its networks too.
+
+    Raises `InputError` if the port is in use, or there is no network.
+    """
+    addresses = lan_addresses() if lan else []
+    if lan and not addresses:
+        raise InputError("--lan: this computer is in no network; connect it to one, or leave --lan out.")
+    # With the protocol named, asyncio sets TCP_NODELAY on every connection; an answer's body waited 40 ms otherwise.
+    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind(("0.0.0.0" if lan else "127.0.0.1", port))
+    except (OSError, OverflowError) as error:
+        listening.close()
+        raise InputError(
+            f"--port {port}: cannot be used ({getattr(error, 'strerror', error)}); end the other session, or choose"
+            " another --port."
+        ) from error
+    return Place(listening, addresses, keys)
+
+
+def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any], tried: Any = None) -> None:
+    """Opens the hub, answers until Ctrl-C or SIGTERM, or until what `started` was given is called, and closes the hub.
+    `tried`: what the page of `hilbo try` is told, where this is one (`tried`).
+
+    Raises what keeps the hub from opening, `InputError` or `DeviceError`; nobody has been answered then.
+    """
+    from hilbo.app.server.admission import Porter
+
+    sys.setswitchinterval(_SWITCH)
+    server = _server(place.gate, hub, tried)
+    admission = _Admission(server)
+    porter = Porter(place.socket, place.gate, max(1, _files() - _RESERVED), admission.admit)
+    _open_and_close(server, hub, porter, admission, started)
+    try:
+        # The default of Windows has no add_reader, which the porter needs.
+        with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
+            runner.run(server.serve(sockets=[]))  # the porter has it
+    finally:
+        place.socket.close()
+
+
+def _server(gate: Gate, hub: Any, tried: Any) -> Any:
+    """A server of uvicorn's that answers for the hub, with connections of our own."""
+    import uvicorn
+
+    from hilbo.app.server.connections import Connection, Connections
+    from hilbo.app.server.server import application
+
+    config = uvicorn.Config(
+        application(hub, gate, tried), log_level="error", access_log=False, lifespan="off", server_header=False,
+        timeout_graceful_shutdown=_LINGER, ws="none",
+        http=functools.partial(Connection, Connections(gate)),  # type: ignore[arg-type]
+    )  # fmt: skip
+    return uvicorn.Server(config)
+
+
+def _open_and_close(
+    server: Any, hub: Any, porter: Any, admission: "_Admission", started: Callable[[Callable[[], None]], Any]
+) -> None:
+    """Have the hub opened before the server answers, and closed after it. Not as ASGI's lifespan, which swallows what
+    the hub raises."""
+    listen, hang_up = server.startup, server.shutdown
+
+    async def startup(sockets=None):
+        try:
+            await hub.open()
+            await listen(sockets=sockets)
+            porter.open()
+        except BaseException:
+            await hub.close()
+            raise
+        if not server.should_exit:
+            started(stop)
+
+    async def shutdown(sockets=None):
+        porter.close()
+        hub.hang_up()
+        await admission.settled()  # uvicorn ends those that it knows, and waits for all
+        try:
+            await hang_up(sockets=sockets)
+        finally:
+            await hub.close()
+
+    def stop() -> None:
+        server.should_exit = True
+
+    server.startup, server.shutdown = startup, shutdown
+
+
+class _Admission:
+    """Has uvicorn serve connections that were accepted elsewhere."""
+
+    def __init__(self, server: Any):
+        self._protocol = functools.partial(
+            server.config.http, config=server.config, server_state=server.server_state, app_state=dict[str, Any]()
+        )
+        self._tasks: set[asyncio.Task] = set()
+
+    def admit(self, line: socket.socket, role: Role | None) -> None:
+        """Serve a connection; the role is that of the key which came with it."""
+        task = asyncio.get_running_loop().create_task(self._serve(line, role))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def settled(self) -> None:
+        """Until each of them is known to uvicorn, or has ended."""
+        await asyncio.gather(*self._tasks)
+
+    async def _serve(self, line, role):
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            loop = asyncio.get_running_loop()
+            await loop.connect_accepted_socket(functools.partial(self._protocol, role=role), line)
+
+
+def _files() -> int:
+    """How many files this process may have open, once it has asked for enough."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return _FILES
+    now, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if now == resource.RLIM_INFINITY or now >= _FILES:
+        return _FILES
+    wanted = _FILES if most == resource.RLIM_INFINITY else min(_FILES, most)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
+    return wanted
+
+
+def qr_image(link: str) -> str:
+    """A link as a picture, in a data: URI."""
+    import segno
+
+    file = io.BytesIO()
+    segno.make(link, error="m").save(file, kind="svg", scale=4, border=3, xmldecl=False, svgns=True)
+    return "data:image/svg+xml;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def qr_text(link: str) -> str:
+    """A link as a picture made of characters, for a terminal."""
+    import segno
+
+    file = io.StringIO()
+    segno.make(link, error="l").terminal(file, border=2, compact=True)
+    return file.getvalue()

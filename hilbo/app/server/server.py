@@ -1,0 +1,338 @@
+"""HTTP around a hub: pages, JSON, and a stream of views for each role.
+
+    GET  /                       trades the token of a link for a key
+    POST /api/join               {"token": …}
+    GET  /participant            the page; so /experimenter
+    GET  /api/participant        the view; so /api/experimenter, and /api/experimenter/map
+    GET  /api/participant/events the same as server-sent events, at every change
+    POST /api/participant/…      answer, begin, break, more, here
+    POST /api/experimenter/…     pause, resume, repeat, undo, void, abort, note, estop, clear, invite
+    POST /api/stimulus/hello     a program that presents begins
+    GET  /preparer               the page of a person who presents; POST /api/preparer/hello and /api/preparer as below
+    POST /api/stimulus           how it is; the answer is the newest order (these two, and join, also as form and lines)
+    GET  /try, /api/try, /api/try/map   the page of `hilbo try` (`tried`), what it presents, and its end
+
+Errors are {"error": sentence}: 400 not understood, 401 no key, 403 from elsewhere, 409 not now, 413 too large. The
+event loop only waits here: files, device and arithmetic have threads of their own.
+"""
+
+import asyncio
+import contextlib
+import html
+import mimetypes
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from hilbo.app.hub.commands import COMMANDS, NotNowError, others_present
+from hilbo.app.hub.hub import PRESSES
+from hilbo.app.rigs.stimulus_rig import OverError, StimulusRig
+from hilbo.app.server.tried import Tried
+from hilbo.app.wire import lines, messages
+from hilbo.app.wire.security import PAGES, Gate, Role
+from hilbo.errors import InputError
+from hilbo.session.log.event_log import LogError
+
+__all__ = ["application"]
+
+# In memory: a visitor then takes neither a file of this process nor a thread of it.
+_FILES = {path.name: path.read_bytes() for path in (Path(__file__).parents[1] / "static").iterdir()}
+_ALIVE = 5.0  # s between signs of life in a silent stream
+_DAY = 86_400
+_TAKEN = "This link has been used by a program that is still there; end that one first, or ask for a new link."
+_JOIN_TEXTS = ("lang", "wait", "no_link", "used_link", "no_server")
+_HEADERS = {
+    b"content-security-policy": b"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';"
+    b" img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    b"x-content-type-options": b"nosniff",
+    b"referrer-policy": b"no-referrer",
+    b"cache-control": b"no-store",
+    b"cross-origin-opener-policy": b"same-origin",
+    b"cross-origin-resource-policy": b"same-origin",
+}
+
+
+class _Guard:
+    """Refuses what comes from elsewhere, before anything looks at it; and says to browsers what pages may do."""
+
+    def __init__(self, app: Any, gate: Gate):
+        self.app, self.gate = app, gate
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        request = Request(scope)
+        cookie = any(name in request.cookies for name in self.gate.cookies.values()) and not _bearer(request)
+        why = self.gate.refuses(request.headers, changes=request.method not in ("GET", "HEAD"), cookie=cookie)
+
+        async def sending(message):
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message["headers"], *_HEADERS.items()]
+            await send(message)
+
+        with contextlib.suppress(ClientDisconnect):  # in mid-body: there is nobody to answer
+            await (_error(403, why) if why else self.app)(scope, receive, sending)
+
+
+def application(hub: Any, gate: Gate, tried: Tried | None = None) -> Starlette:
+    """The server of one session, whose `Hub` is open; or of what stands in a hub's place. `tried`: it is `hilbo try`'s,
+    and has its page."""
+    guarded = _for(hub, gate)
+    routes = [
+        Route("/", _way_in(hub)),
+        Route("/api/join", _either(_join(hub, gate)), methods=["POST"]),
+        Route("/api/experimenter/map", guarded("experimenter", _map), methods=["GET"]),
+    ]
+    for role in PAGES:
+        routes += [Route(f"/{role}", _role_page(hub, gate, role))]
+    for role in ("participant", "experimenter"):
+        routes += [
+            Route(f"/api/{role}", guarded(role, _view), methods=["GET"]),
+            Route(f"/api/{role}/events", guarded(role, _events), methods=["GET"]),
+        ]
+    routes += [Route("/api/participant/answer", guarded("participant", _answer), methods=["POST"])]
+    routes += [Route(f"/api/participant/{n}", guarded("participant", _press), methods=["POST"]) for n in PRESSES]
+    routes += [Route(f"/api/experimenter/{n}", guarded("experimenter", _command), methods=["POST"]) for n in COMMANDS]
+    routes += [Route("/api/preparer", guarded("preparer", _report), methods=["POST"])]
+    routes += [Route("/api/preparer/hello", guarded("preparer", _hello), methods=["POST"])]
+    routes += [Route("/api/stimulus", _either(guarded("stimulus", _report)), methods=["POST"])]
+    routes += [Route("/api/stimulus/hello", _either(guarded("stimulus", _hello)), methods=["POST"])]
+    if tried is not None:
+        routes += [Route("/try", _page("try.html")), Route("/api/try", guarded("stimulus", _json_of(tried.facts)))]
+        routes += [Route("/api/try/map", guarded("stimulus", _json_of(tried.map)))]
+    routes += [Route(f"/static/{name}", _page(name)) for name in _FILES]
+    return Starlette(routes=routes, middleware=[Middleware(_Guard, gate=gate)])
+
+
+def _file(name) -> Response:
+    return Response(_FILES[name], media_type=mimetypes.guess_type(name)[0])
+
+
+def _page(name):
+    async def page(_request: Request) -> Response:
+        return _file(name)
+
+    return page
+
+
+def _join_page(hub, status=200) -> Response:
+    """The page that trades a link's token, in the study's language."""
+    page = _FILES["join.html"].decode()
+    for key in _JOIN_TEXTS:
+        page = page.replace(f"{{{key}}}", html.escape(hub.text(key)))
+    return HTMLResponse(page, status)
+
+
+def _way_in(hub):
+    async def page(_request: Request) -> Response:
+        return _join_page(hub)
+
+    return page
+
+
+def _role_page(hub, gate, role):
+    async def page(request: Request) -> Response:
+        if not gate.admits(role, request.cookies.get(gate.cookies[role])):
+            return _join_page(hub, 401)
+        return _file(f"{role}.html")
+
+    return page
+
+
+def _either(handler):
+    """The handler's answer in JSON, or in lines to whoever sent a form."""
+
+    async def handle(request: Request) -> Response:
+        answer = await handler(request)
+        if not getattr(request.state, "form", _is_form(request)):
+            return answer
+        text = lines.lines_of(answer.status_code, msgspec.json.decode(answer.body))
+        return Response(text, media_type="text/plain")
+
+    return handle
+
+
+def _is_form(request) -> bool:
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower() == lines.FORM
+
+
+async def _message(kind, request) -> Any:
+    """The request's message; an object of JSON is one whatever its header says: many clients call all bodies forms."""
+    body = await _body(request)
+    request.state.form = _is_form(request) and not body.lstrip().startswith(b"{")
+    return messages.read(kind, body, request.state.form)
+
+
+def _join(hub, gate):
+    async def join(request: Request) -> Response:
+        try:
+            message = await _message(messages.Join, request)
+        except InputError as error:
+            return _not_understood(error)
+        if gate.asked_for(message.token) == "stimulus" and not message.bearer:
+            return _error(400, "This link is for a program that presents, not for a browser; give it to the program.")
+        used_by = gate.let_in(message.token)
+        if used_by in PAGES and gate.admits(used_by, request.cookies.get(gate.cookies[used_by])):
+            return JSONResponse({"role": used_by})  # the same browser opens its link again
+        back = used_by == "stimulus" and message.bearer and isinstance(hub.rig, StimulusRig)
+        if back and not await hub.rig.free():
+            return _error(401, _TAKEN)
+        try:
+            granted = gate.redeem(message.token, again=back)
+        except InputError as error:
+            return _error(503, str(error))
+        if granted is None:
+            return _error(401, "This link has been used, or is not of this session; ask for a new one.")
+        role, key = granted
+        hub.watchers.end(role)
+        if message.bearer:
+            return JSONResponse({"role": role, "key": key})
+        reply = JSONResponse({"role": role})
+        reply.set_cookie(gate.cookies[role], key, max_age=_DAY, httponly=True, samesite="strict", path="/")
+        return reply
+
+    return join
+
+
+def _for(hub, gate):
+    """Makes handlers of (hub, role, request) that only somebody with the role's key reaches."""
+
+    def guarded(role: Role, handler: Callable):
+        async def handle(request: Request) -> Response:
+            program = _bearer(request)
+            if not gate.admits(role, program or request.cookies.get(gate.cookies.get(role, ""))):
+                await _body(request)  # the connection ends with the answer, and with it what is still on its way
+                return _error(401, "Open the link of this session first; this page is no longer part of it.")
+            if program and role == "participant":
+                hub.watchers.heard()
+            try:
+                return await handler(hub, role, request)
+            except LogError as error:
+                return _json({"error": str(error)}, 503)
+            except OverError as error:
+                return _json({"error": str(error), **error.standing}, 409)
+            except NotNowError as error:
+                return _json({"error": str(error), "view": hub.view(role)}, 409)
+            except InputError as error:
+                return _not_understood(error)
+
+        return handle
+
+    return guarded
+
+
+async def _view(hub, role, _request) -> Response:
+    return _json(hub.view(role))
+
+
+async def _map(hub, _role, _request) -> Response:
+    slices = await hub.map()
+    return _error(404, "This session has no map.") if slices is None else _json(slices)
+
+
+def _json_of(content):
+    """A handler of what is found in a hub."""
+
+    async def handle(hub, _role, _request) -> Response:
+        return _json(await content(hub))
+
+    return handle
+
+
+async def _answer(hub, role, request) -> Response:
+    message = messages.read(messages.Answer, await _body(request))
+    accepted = await hub.answer(message, _page_of(request))
+    return _json(accepted | {"view": hub.view(role)})
+
+
+async def _press(hub, role, request) -> Response:
+    message = messages.read(messages.Press, await _body(request))
+    await hub.press(request.url.path.rpartition("/")[2], message, _page_of(request))
+    return _json({"view": hub.view(role)})
+
+
+async def _command(hub, _role, request) -> Response:
+    message = messages.read(messages.Command, await _body(request))
+    return _json(await hub.command(request.url.path.rpartition("/")[2], message))
+
+
+def _presenter(hub, role) -> StimulusRig:
+    """The rig that a program is, or a person. Raises `InputError` where another presents."""
+    if not isinstance(hub.rig, StimulusRig) or hub.rig.role != role:
+        raise InputError(others_present(hub.rig.title))
+    return hub.rig
+
+
+async def _hello(hub, role, request) -> Response:
+    message = await _message(messages.Hello, request)
+    return _json(await _presenter(hub, role).hello(message, _bearer(request) or ""))
+
+
+async def _report(hub, role, request) -> Response:
+    return _json(await _presenter(hub, role).report(await _message(messages.Report, request)))
+
+
+async def _events(hub, role, request) -> Response:
+    page = request.query_params.get("page", "")
+    return StreamingResponse(_stream(hub, role, page[:64]), media_type="text/event-stream")
+
+
+async def _stream(hub, role, page) -> AsyncIterator[bytes]:
+    """The view now and after every change; the newest one where several came at once."""
+    watcher = hub.watchers.add(role, page)
+    hub.publish()
+    try:
+        yield b"retry: 1000\n\n"
+        while not watcher.ended:
+            watcher.news.clear()
+            yield b"event: view\ndata: " + msgspec.json.encode(hub.view(role)) + b"\n\n"
+            while not watcher.news.is_set():
+                try:
+                    await asyncio.wait_for(watcher.news.wait(), _ALIVE)
+                except TimeoutError:
+                    yield b": alive\n\n"
+        if watcher.why:
+            yield b"event: moved\ndata: " + msgspec.json.encode({"error": watcher.why}) + b"\n\n"
+    finally:
+        hub.watchers.remove(watcher)
+        hub.publish()
+
+
+async def _body(request) -> bytes:
+    """The body, or as much of it as shows that it is too large."""
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > messages.LARGEST:
+            break
+    return body
+
+
+def _bearer(request) -> str | None:
+    kind, _, key = request.headers.get("authorization", "").partition(" ")
+    return key.strip() if kind.lower() == "bearer" and key.strip() else None
+
+
+def _page_of(request) -> str | None:
+    """Which window of a browser sends this; None for a program with a key."""
+    return None if _bearer(request) else request.headers.get("x-hilbo-page", "")[:64]
+
+
+def _json(content, status=200) -> Response:
+    return Response(msgspec.json.encode(content), status, media_type="application/json")
+
+
+def _not_understood(error) -> Response:
+    return _error(413 if isinstance(error, messages.TooLargeError) else 400, str(error))
+
+
+def _error(status, sentence) -> Response:
+    return JSONResponse({"error": sentence}, status)

@@ -1,0 +1,88 @@
+"""`hilbo try`: what its one page is told, which presents the blocks, takes the answers and shows the map at the end.
+
+The page (static/try.js) is the stimulus and the participant of an ordinary session at once. It renders the reference
+too, so that it has to know its parameters: such answers are unblinded, and the log says so. Displacement follows force
+by the recursion of the firmware's core with full memory, solved for the position; `FIXED` are the model's parameters
+that the study does not vary. Loads no JAX before it is asked.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from hilbo.app.interface import Held
+from hilbo.errors import InputError
+from hilbo.study.file.protocols import protocol
+from hilbo.study.file.reading import AnyStudy, StudyFile
+
+__all__ = ["FIXED", "NAMES", "STATES", "Tried", "check_study", "hidden_reference"]
+
+NAMES = ("K1", "B1", "alpha")
+STATES = 10
+FIXED = {"K0": 0.3, "T": 1e-3}
+"""K0 (N/mm), the static stiffness, and T (s), the time between two samples."""
+_ANSWERS = 3  # buttons of the page
+_MIDDLE = (0.2, 0.8)  # of each range: where the reference may be, so that answers surround it
+
+
+class Tried:
+    """The end of the page's and the model's. `study` is the session's, `reference` parameter -> physical value."""
+
+    def __init__(self, study: AnyStudy, reference: Mapping[str, float]):
+        self._study, self._reference = study, dict(reference)
+
+    async def facts(self, _hub: Held) -> dict[str, Any]:
+        """What the page presents by."""
+        from hilbo.mechanics.exponentials import TABLE
+
+        return FIXED | {"reference": self._reference, "table": TABLE[STATES]}
+
+    async def map(self, hub: Held) -> dict[str, Any]:
+        """The slices of one's own map through its optimum, and each parameter's range, hidden and found value, in the
+        study's unit and on [0, 1]. Without slices while they are being prepared, or before the last answer."""
+        if hub.state.screen not in ("done", "ended"):
+            raise InputError("The map is shown after the last answer.")
+        slices = await hub.map()
+        if not slices:
+            return {}
+        best = {s[axis]: s["best"][i] for s in slices["slices"] for i, axis in enumerate(("across", "up"))}
+        return slices | {"parameters": [self._compared(i, best) for i in range(self._study.space.dim)]}
+
+    def _compared(self, i: int, best: Mapping[str, float]) -> dict[str, Any]:
+        parameter = self._study.space.parameters[i]
+        hidden, optimum = self._reference[parameter.name], best[parameter.name]
+        return {
+            "name": parameter.name, "unit": parameter.unit, "scale": parameter.scale,
+            "low": parameter.low, "high": parameter.high,
+            "hidden": hidden, "hidden_unit": float(parameter.to_unit(np.asarray(hidden))),
+            "optimum": float(parameter.to_physical(np.asarray(optimum))), "optimum_unit": optimum,
+        }  # fmt: skip
+
+
+def check_study(study: StudyFile) -> None:
+    """Refuse a study that the page cannot present. Raises `InputError`."""
+    if study.stimulus is None:
+        raise InputError(
+            f"{study.source}: has a [renderer], and hilbo try presents by itself; use one with [stimulus]."
+        )
+    if study.stimulus.by == "person" or study.stimulus.experimenter_sees is False:
+        raise InputError(
+            f"{study.source}: the page of hilbo try presents by itself and shows the map at the end; leave by and"
+            " experimenter_sees out of [stimulus]."
+        )
+    if set(study.space.names) != set(NAMES) or study.materials:
+        raise InputError(f"{study.source}: hilbo try presents {', '.join(NAMES)} of one material, and nothing else.")
+    if len(study.responses) != _ANSWERS:
+        raise InputError(f"{study.source}: has {len(study.responses)} responses; the page of hilbo try has three.")
+    if [step.show for step in protocol(study.session, "optimisation").steps] != ["a"]:
+        raise InputError(
+            f"{study.source}: hilbo try shows test and reference at once; write under [session.optimisation]"
+            ' steps = [{show = "a", seconds = 600}].'
+        )
+
+
+def hidden_reference(study: AnyStudy, seed: int) -> dict[str, float]:
+    """The reference of a seed: parameter -> physical value, anywhere in the middle of the ranges."""
+    unit = np.random.default_rng([seed, len(NAMES)]).uniform(*_MIDDLE, study.space.dim)
+    return {p.name: float(p.to_physical(u)) for p, u in zip(study.space.parameters, unit, strict=True)}

@@ -1,0 +1,273 @@
+"""`hilbo device`: a rendering device on a line, or a simulated one, from the command line.
+
+Results on stdout (`--json` for machines), progress and warnings on stderr. Exit code 0: done, 1: the device or the line
+failed, 2: bad usage or bad input, numbers that the device refuses included. The device is stopped at the end of every
+command.
+"""
+
+import contextlib
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilbo.cli.device import commission, measure
+from hilbo.cli.device.options import Chosen, Line, chosen_set, opened, sets_of, takes
+from hilbo.cli.device.output import condition_words, decoded, said, set_words
+from hilbo.cli.terminal.console import ForceFile, JsonToo, fail, print_result
+from hilbo.cli.terminal.new_file import check_free, new_file
+from hilbo.errors import InputError
+
+__all__ = ["app"]
+
+
+app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode="markdown", help="A rendering device: connect, send sets, feel, measure."
+)
+for name, command in (measure.COMMANDS | commission.COMMANDS).items():
+    app.command(name)(command)
+
+_LEAVES = 10.0  # s for a handle that is pressed to leave
+_PIECE = 1.0  # s of a recording between two writes to its file
+
+Seconds = Annotated[float | None, typer.Option(help="End after so many seconds of the device's time.")]
+
+
+@app.command()
+def ports(as_json: JsonToo = False) -> None:
+    """The serial ports of this computer."""
+    from hilbo.device.ports import list_ports
+
+    serial_ports = list_ports()
+    words = "\n".join(f"{port.name}  {port.description}" for port in serial_ports) or "There is no serial port."
+    print_result([port._asdict() for port in serial_ports], words, as_json)
+
+
+@app.command()
+@takes(line=Line)
+def hello(line: Line, as_json: JsonToo = False) -> None:
+    """Who is there: version, limits, damping, stroke, and what it can do."""
+    from dataclasses import asdict
+
+    from hilbo.device.reasons import Capability
+
+    with opened(line) as device:
+        about = asdict(device.device)
+        in_force = device.in_force()
+        condition = device.condition()
+        can = [flag.name.lower() for flag in Capability(about["capabilities"]) if flag.name]
+        content = about | {
+            "can": can,
+            **condition._asdict(),
+            "limits": device.limits(),
+            "telemetry_divisor": device.divisor,
+            "in_force": in_force and in_force._asdict(),
+        }
+    limits = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in content["limits"].items())
+    rows = [f"{name:26} {said(name, value)}" for name, value in about.items()]
+    rows += [f"{'can':26} {', '.join(can)}", condition_words(condition)]
+    now = set_words(in_force) if in_force else "none"
+    words = "\n".join([*rows, f"limits  {limits}", f"in force  {now}"])
+    print_result(content, words, as_json)
+
+
+@app.command("set")
+@takes(chosen=Chosen, line=Line)
+def set_(chosen: Chosen, line: Line, as_json: JsonToo = False) -> None:
+    """Put a set in force, and read it back bit for bit. Nothing is started."""
+    wanted = chosen_set(chosen, line)
+    if wanted is None:
+        raise InputError("No set is given; a set has --K1, --B1 and --alpha, or --sets and --name.")
+    with opened(line) as device:
+        in_force = device.send(**wanted)
+    print_result(in_force._asdict(), f"in force: {set_words(in_force)}", as_json)
+
+
+@app.command()
+@takes(chosen=Chosen, line=Line)
+def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: JsonToo = False) -> None:
+    """Render the set that is in force, or the one that is given, until Ctrl-C; then stop."""
+    from hilbo.cli.device.screen import watch
+
+    wanted = chosen_set(chosen, line)
+    with opened(line) as device:
+        _begin(device, wanted)
+        content = watch(device, seconds, "rendering; Ctrl-C stops")
+    print_result(content, "", as_json)
+    if content["state"] in ("HOLD", "ESTOP"):
+        fail(f"The device has gone to {content['state']} by itself; find out why, then clear it.", 1)
+
+
+@app.command()
+@takes(line=Line)
+def stop(line: Line, as_json: JsonToo = False) -> None:
+    """Force to zero, smoothly, whoever started it."""
+    _at_once(line, "Stop", as_json)
+
+
+@app.command()
+@takes(line=Line)
+def estop(line: Line, as_json: JsonToo = False) -> None:
+    """Force to zero at once, latched until `clear`."""
+    _at_once(line, "Estop", as_json)
+
+
+@app.command()
+@takes(line=Line)
+def clear(line: Line, as_json: JsonToo = False) -> None:
+    """Leave HOLD or ESTOP, once the reason is understood."""
+    with opened(line) as device:
+        device.clear()
+        state = device.state().name
+    print_result({"state": state}, f"the device is {state}", as_json)
+
+
+@app.command()
+@takes(line=Line)
+def monitor(line: Line, seconds: Seconds = None, as_json: JsonToo = False) -> None:
+    """State, force and position as they go by. Nothing is started."""
+    from hilbo.cli.device.screen import watch
+
+    with opened(line) as device:
+        content = watch(device, seconds)
+    print_result(content, "", as_json)
+
+
+@app.command()
+@takes(chosen=Chosen, line=Line)
+def record(
+    out: Annotated[Path, typer.Argument(help="CSV file to write.", show_default=False)],
+    chosen: Chosen,
+    line: Line,
+    seconds: Annotated[float, typer.Option(min=0.001, help="So many seconds of the device's time.")] = 5.0,
+    render: Annotated[bool, typer.Option("--render/--no-render", help="Start the set first, and stop after.")] = True,
+    force: ForceFile = False,
+    as_json: JsonToo = False,
+) -> None:
+    """Telemetry to a CSV file: tick, time_s, position_mm, force_N, sensed_N, flags. Ctrl-C ends it earlier."""
+    from hilbo.device.failures import DeviceError
+
+    check_free(out, force)
+    wanted = chosen_set(chosen, line)
+    with opened(line) as device:
+        if render:
+            _begin(device, wanted)
+        device.samples(0.0)
+        with new_file(out) as path:
+            samples, ended = _recorded(device, seconds, path)
+            if not samples:
+                raise ended or KeyboardInterrupt
+        if ended is not None:
+            raise DeviceError(f"{ended} {out} holds the {samples} samples until then.") from ended
+        state, counts = device.state().name, device.counts()
+    content = {"file": str(out), "samples": samples, "state": state, "counts": counts._asdict()}
+    print_result(content, f"{out}: {samples} samples", as_json)
+
+
+def _recorded(device: Any, seconds: float, path: Path) -> tuple[int, Exception | None]:
+    """How many samples were written, as they came, and what the device or its line ended that by."""
+    from hilbo.device.failures import DeviceError
+
+    samples, begun, ticks = 0, None, seconds / device.tick_s
+    with path.open("w", encoding="utf-8", newline="") as file, contextlib.suppress(KeyboardInterrupt):
+        while True:
+            try:
+                piece = device.samples(min(_PIECE, seconds))
+            except DeviceError as error:
+                return samples, error
+            begun = int(piece.tick[0]) if begun is None else begun
+            piece.table(device.tick_s, begun).to_csv(file, index=False, header=samples == 0)
+            samples += len(piece.tick)
+            if piece.tick[-1] + 1 - begun >= ticks:
+                break
+    return samples, None
+
+
+@app.command()
+def decode(
+    capture: Annotated[Path, typer.Argument(help="Bytes of a line, as --capture writes them.", show_default=False)],
+    as_json: JsonToo = False,
+) -> None:
+    """Captured bytes made readable: every frame, and what is wrong with the others."""
+    from dataclasses import asdict
+
+    from hilbo.device.protocol import WireError, frames_in, name_of
+
+    try:
+        data = capture.read_bytes()
+    except OSError as error:
+        raise InputError(f"{capture}: cannot be read ({error.strerror}).") from error
+    rows: list[dict[str, Any]] = []
+    for place, message, frame in frames_in(data):
+        seq = None if frame is None else frame.seq
+        if isinstance(message, WireError):
+            rows.append({"byte": place, "seq": seq, "message": None, "wrong": str(message)})
+        else:
+            rows.append({"byte": place, "seq": seq, "message": name_of(type(message)), "fields": asdict(message)})
+    words = "\n".join(decoded(row) for row in rows)
+    print_result(
+        json.loads(json.dumps(rows, default=lambda value: value.hex())), words or "The file has no frames.", as_json
+    )
+
+
+@app.command()
+@takes(line=Line)
+def feel(
+    sets: Annotated[Path, typer.Argument(help="Sets table (CSV), one set for each key.", show_default=False)],
+    line: Line,
+    seconds: Seconds = None,
+    as_json: JsonToo = False,
+) -> None:
+    """Switch between sets with keys, the finger on the device: 1 to 9, space, e, c, q."""
+    from hilbo.cli.device import screen
+
+    wanted = sets_of(sets, line)
+    with opened(line) as device:
+        content = screen.feel(device, wanted, seconds)
+    print_result(content, "", as_json)
+
+
+@app.command()
+@takes(line=Line)
+def simulate(line: Line) -> None:
+    """A simulated device that stays, for other programs: prints its port, ends with Ctrl-C."""
+    from hilbo.cli.device.options import simulator
+
+    device = simulator(line)
+    try:
+        print(device.port, flush=True)
+        while device.alive():
+            time.sleep(0.1)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        device.close()
+
+
+def _begin(device, wanted) -> None:
+    if wanted is not None:
+        print(f"in force: {set_words(device.send(**wanted))}", file=sys.stderr)
+    if device.status().contact:
+        print("hilbo: the handle is in the material; rendering starts when it leaves the surface", file=sys.stderr)
+    device.start(wait=_LEAVES)
+
+
+def _at_once(line, name, as_json) -> None:
+    """A request that is obeyed before HELLO: nothing else is said first."""
+    from hilbo.device import protocol
+    from hilbo.device.link import Link
+    from hilbo.device.ports import open_port
+
+    if line.device == "sim":
+        with opened(line) as device:
+            getattr(device, name.lower())()
+    else:
+        link = Link(open_port(line.device, line.baud), patience=line.patience or 0.1)
+        try:
+            link.request(getattr(protocol, name)())
+        finally:
+            link.close()
+    print_result({"done": name.lower()}, "done", as_json)

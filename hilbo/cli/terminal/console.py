@@ -1,0 +1,291 @@
+"""What every command does around its work: float64 and caches, a results folder that is whole or absent, progress.
+
+A folder is written beside its final place and moved there when it is complete, so that a failure leaves nothing behind
+and nothing is overwritten without `--force`. Progress goes to stderr, results with `--json` to stdout.
+"""
+
+import contextlib
+import gc
+import itertools
+import json
+import math
+import os
+import shlex
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from hilbo.errors import InputError, InputRemark
+
+__all__ = [
+    "PARTS",
+    "Force",
+    "ForceFile",
+    "Json",
+    "JsonToo",
+    "Out",
+    "Preset",
+    "Say",
+    "cache_folder",
+    "check_choice",
+    "fail",
+    "finish",
+    "print_result",
+    "progress",
+    "remark",
+    "results",
+    "say_remarks",
+    "seed_option",
+    "start",
+]
+
+Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        "--preset",
+        help="Whom the people are drawn from: paper, paper-individuals, or paper-01 to paper-30; by default what the"
+        " study states in [simulation].",
+    ),
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace an existing results folder.")]
+ForceFile = Annotated[bool, typer.Option("--force", help="Replace an existing file.")]
+Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")]
+JsonToo = Annotated[bool, typer.Option("--json", help="Print what is said as JSON on stdout.")]
+
+PARTS = ("video-quality", "simulated-memory-foam")
+_EVERY = 10.0  # s
+
+
+def seed_option(what: str) -> Any:
+    """The option --seed of a command, for `Annotated`; `what` it decides ends its help."""
+    return typer.Option("--seed", min=0, max=2**31 - 1, help=f"Random seed {what}.")
+
+
+def start(devices: int | None = None) -> None:
+    """Float64, and compiled programs kept in the user's cache folder from one command to the next.
+    HILBO_KEEP_PROGRAMS=0 traces and compiles them anew.
+
+    `devices`: as how many devices the CPU is to count.
+    """
+    # Matrices are small here: a second thread of OpenBLAS, which reads this once, keeps a core busy by waiting.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Programs and figures are many small objects that live until the end: looking for cycles among them finds none.
+    gc.set_threshold(50_000, 20, 50)
+    from hilbo.numerics.compiling import set_flags
+
+    set_flags()
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    if devices is not None:
+        jax.config.update("jax_num_cpu_devices", devices)
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if os.environ.get("HILBO_KEEP_PROGRAMS", "1") != "0":
+        _keep_programs()
+
+
+def cache_folder() -> Path:
+    """Where programs are kept: for this user, and for all studies."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")) / "hilbo"
+
+
+def _keep_programs() -> None:
+    from hilbo.numerics.tracing import keep_with
+    from hilbo.programs.entries import Entries
+    from hilbo.programs.keeping import Programs
+
+    keep_with(Programs(Entries(cache_folder() / "programs", remark), Path(__file__).parents[2]))
+
+
+@contextlib.contextmanager
+def orderly() -> Iterator[None]:
+    """SIGTERM ends the command as Ctrl-C does: a device is told to stop, and nothing half written is left behind."""
+
+    def end(_number, _frame):
+        raise SystemExit(143)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def results(out: Path, force: bool) -> Iterator[Path]:
+    """A new folder that becomes `out` when everything in it is complete; with a list of what it holds, so that
+    `force` replaces nothing else later."""
+    from hilbo.report.figures.painter import begin_painter
+    from hilbo.study.results.listing import list_files
+
+    out = out.resolve()
+    _check_free(out, force)
+    begin_painter()
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        made = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
+    try:
+        with orderly():
+            yield made
+            made.chmod(0o755)
+            list_files(made, shlex.join(["hilbo", *sys.argv[1:]]), os.getcwd())
+            _publish(made, out, force)
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _publish(made: Path, out: Path, force: bool) -> None:
+    """The complete folder `made` becomes `out`. What somebody put there meanwhile stays, and so does what was made,
+    under another name."""
+    try:
+        _check_free(out, force)
+    except InputError as error:
+        beside = next(path for n in itertools.count(2) if not (path := out.with_name(f"{out.name}-{n}")).exists())
+        made.rename(beside)
+        raise InputError(f"{error} It came while this was computed; these results are in {beside}.") from None
+    if out.exists():
+        shutil.rmtree(out)
+    made.rename(out)
+
+
+def _check_free(out: Path, force: bool) -> None:
+    """Refuse to replace anything without `force`, and with it anything that is not hilbo's."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise InputError(f"{out}: is a file; choose a folder for --out.")
+    if any(out.iterdir()) and not force:
+        raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
+    from hilbo.study.results.listing import LIST, digest, listed
+
+    ours = listed(out).files
+    for path in sorted(path for path in out.rglob("*") if not path.is_dir()):
+        name = path.relative_to(out).as_posix()
+        if name not in ours and name != LIST:
+            raise InputError(f"{path}: is not a result of hilbo's; choose another --out, so that it is not lost.")
+        if name in ours and digest(path) != ours[name]:
+            raise InputError(f"{path}: has been changed since hilbo wrote it; choose another --out, or delete it.")
+
+
+class Say:
+    """Told what is being done and, where that is counted, how many are done already, and of how many."""
+
+    def __init__(self, console: Any, status: Any):
+        self._console, self._status, self._pace = console, status, _Pace()
+        self.printed: list[str] = []
+
+    def __call__(self, text: str, done: int | None = None, people: int | None = None) -> None:
+        line, new = self._pace.line(text, done, people, time.perf_counter())
+        if self._console.is_terminal:
+            self._status.update(line)
+        elif new:
+            self._console.print(line)
+
+    def tell(self, sentences: list[str]) -> None:
+        """Results that are known before the others; they stay on a terminal too."""
+        self.printed += sentences
+        for sentence in sentences:
+            self._console.print(sentence)
+
+
+@contextlib.contextmanager
+def progress(quiet: bool = False) -> Iterator[Say]:
+    """Says on stderr what is being done: in one changing line on a terminal, else in a line for each thing, or every
+    ten seconds for one that takes longer. `quiet`: says nothing, for the processes whose results are not written."""
+    from rich.console import Console
+
+    console, begun = Console(stderr=True, highlight=False, markup=False, soft_wrap=True), time.perf_counter()
+    console.quiet = quiet
+    with console.status("starting") as status:
+        yield Say(console, status)
+    console.print(f"done in {time.perf_counter() - begun:.1f} s")
+
+
+class _Pace:
+    """The words for work that goes by participants: how many are done, and how long the others will take."""
+
+    def __init__(self) -> None:
+        self.text, self.done, self.first, self.last_shown = "", 0, (0, 0.0), -math.inf
+
+    def line(self, text: str, done: int | None, people: int | None, now: float) -> tuple[str, bool]:
+        """The line, and whether it is news where there is no line that changes."""
+        if done is None:
+            self.text = text
+            return text, True
+        if text != self.text or done < self.done:  # the first report has the compilation in it, and tells no pace
+            again = text == self.text
+            self.text, self.first, self.last_shown = text, (done, now), self.last_shown if again else -math.inf
+        self.done = done
+        done_before, time_before = self.first
+        line = f"{done:,} {text}" if people is None else f"{done:,} of {people:,} {text}"
+        if people is not None and done_before < done < people:
+            left = round((now - time_before) / (done - done_before) * (people - done))
+            line += f", {left // 60}:{left % 60:02d} left"
+        if now - self.last_shown < _EVERY:
+            return line, False
+        self.last_shown = now
+        return line, True
+
+
+def check_choice(option: str, value: Any, allowed: Collection[Any]) -> None:
+    """Raises InputError where an option has none of its values; None among them is one that was not given."""
+    if value not in allowed:
+        names = [str(name) for name in allowed if name is not None]
+        listed = f"one of {', '.join(names)}" if len(names) > 2 else " or ".join(names)
+        raise InputError(f'--{option} is "{value}"; it must be {listed}.')
+
+
+def finish(content: dict[str, Any], out: Path, as_json: bool, printed: Collection[str] = ()) -> None:
+    """The last words of a command: warnings that were not told before, then result.json or the way to the report."""
+    for warning in content.get("warnings", []):
+        if warning not in printed:
+            remark(warning)
+    if as_json:
+        with (out / "result.json").open(encoding="utf-8") as file:
+            shutil.copyfileobj(file, sys.stdout)
+    else:
+        print(f"{out / 'report.html'}", file=sys.stderr)
+
+
+def print_result(content: Any, words: str, as_json: bool) -> None:
+    """A result without a folder, for a machine or in words, on stdout."""
+    if as_json:
+        print(json.dumps(content, indent=2, allow_nan=False, default=float))
+    elif words:
+        print(words)
+
+
+def remark(sentence: str) -> None:
+    """One sentence on stderr."""
+    print(f"hilbo: {sentence}", file=sys.stderr)
+
+
+def say_remarks(show: Callable[..., None]) -> Callable[..., None]:
+    """`warnings.showwarning` that says an `InputRemark` in its one sentence, and everything else as `show` does."""
+
+    def said(message: Warning | str, category: type[Warning], *where: Any) -> None:
+        if issubclass(category, InputRemark):
+            remark(str(message))
+        else:
+            show(message, category, *where)
+
+    return said
+
+
+def fail(sentence: str, code: int) -> NoReturn:
+    """One sentence on stderr, and the end."""
+    remark(sentence)
+    sys.exit(code)

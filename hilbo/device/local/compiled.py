@@ -1,0 +1,95 @@
+"""Programs and libraries of the firmware's C sources, for this computer.
+
+The sources travel with hilbo. They are built once with the C compiler that is there, into the user's cache folder,
+under a name made of sources, compiler and flags, so that nothing stale is ever run.
+"""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+from hilbo.device.failures import DeviceError
+
+__all__ = ["compiled"]
+
+_FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-fno-strict-aliasing", "-D_XOPEN_SOURCE=700", "-pthread")
+_SHARED = ("-shared", "-fPIC", "-fvisibility=hidden")
+_COMPILERS = ("cc", "gcc", "clang")
+
+
+def compiled(name: str, what: str, parts: Sequence[str], sources: Sequence[str] = (), shared: bool = False) -> Path:
+    """The program (or shared library) `name`, built if this computer has not built it before.
+
+    `what` names it in sentences. `parts`: the folders of its headers and sources. `sources`: patterns of the C files,
+    if not all of these folders. Raises `DeviceError` where it cannot be built, and says what to install.
+    """
+    root, compiler = _sources(what), _compiler(what)
+    files = [path for folder in parts for path in sorted((root / folder).glob("*.[ch]"))]
+    kind = _SHARED if shared else ()
+    flags = [*_FLAGS, *kind, f"-DHB_FIRMWARE_HASH={_firmware_hash(root)}U", *(f"-I{folder}" for folder in parts)]
+    version = subprocess.run([compiler, "--version"], capture_output=True).stdout
+    digest = hashlib.sha256(repr((compiler, flags, sources)).encode() + version)
+    for path in files:
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    program = _cache() / f"device-{digest.hexdigest()[:16]}" / name
+    if not program.exists():
+        patterns = sources or [f"{folder}/*.c" for folder in parts]
+        inputs = [path.relative_to(root).as_posix() for name in patterns for path in sorted(root.glob(name))]
+        _build(program, what, [compiler, *flags, *inputs], root)
+    return program
+
+
+def _build(program: Path, what: str, command: Sequence[str], root: Path) -> None:
+    """Build beside the final place and move it there whole, so that two who build at once do no harm."""
+    try:
+        program.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix="build-", dir=program.parent))
+    except OSError as error:
+        raise DeviceError(
+            f"{program.parent}: {what} cannot be built there ({error.strerror}); set XDG_CACHE_HOME to a folder of"
+            " yours."
+        ) from error
+    try:
+        made = folder / program.name
+        done = subprocess.run([*command, "-o", str(made), "-lm"], cwd=root, capture_output=True, text=True)
+        if done.returncode:
+            first = next(iter(done.stderr.strip().splitlines()), "no reason given")
+            raise DeviceError(f"{what.capitalize()} does not compile with {command[0]}: {first}")
+        made.replace(program)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _sources(what: str) -> Path:
+    here = Path(__file__).parents[2]
+    for root in (here / "firmware", here.parent / "firmware"):  # installed; a checkout
+        if (root / "core").is_dir():
+            return root
+    raise DeviceError(f"This installation of hilbo lacks the sources of {what}; install hilbo again.")
+
+
+def _compiler(what: str) -> str:
+    for name in (os.environ.get("CC", ""), *_COMPILERS):
+        path = shutil.which(name) if name else None
+        if path:
+            return path
+    install = "xcode-select --install" if sys.platform == "darwin" else "on Debian: apt install gcc"
+    raise DeviceError(
+        f"{what.capitalize()} is built once from C, and there is no C compiler; install one ({install}), or use a"
+        " device on a port."
+    )
+
+
+def _firmware_hash(root: Path) -> int:
+    """As firmware/Makefile has it: the CRC-32 of the core's sources."""
+    return zlib.crc32(b"".join(path.read_bytes() for path in sorted((root / "core").glob("*.[ch]"))))
+
+
+def _cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hilbo"

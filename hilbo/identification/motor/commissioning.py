@@ -1,0 +1,282 @@
+"""Commissioning: a device with unchecked signs is tested at low energy, homed and measured.
+
+The order is the order of trust. With the motor at rest a person pushes the handle in, which gives the encoder's sign.
+Nudges (DRIVE, shape 3) then give the motor's: a force that ends by itself when the handle has moved, bounded by
+`Bounds`. The first wrong sign ends the commissioning, latches the emergency stop, and nothing pushes again. Only a
+device with both signs right is homed, driven, and measured.
+
+Positions and drives are positive inwards, into the material. Units: mm, N, s, mJ, delay in µs, damping N·s/m.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from hilbo.device.reasons import SampleFlag, held_because, meaning
+from hilbo.hardware_bridge import Capability, DeviceError, RefusalError, Renderer, State
+from hilbo.identification.motor.device_tests import drive, measure_damping, wait_until
+from hilbo.identification.motor.friction import Friction
+
+__all__ = ["Bounds", "Commissioned", "Nudge", "Person", "commission", "damping_for", "delay_for", "find_signs"]
+
+_FEWEST = 2  # encoder steps of a movement whose direction counts
+_STILL, _REST = 0.3, 10.0  # s without movement before a nudge, and how long to wait for them
+_RAISE = 1.5  # from a force that moves nothing to the next
+_BY_HAND = 1.0  # mm
+_PATIENCE = 120.0  # s for a push by hand
+_LASTS = 3.0  # s of the drive at 0 N
+_WAITS = 10.0  # s for the heaviest set's history
+_MARGIN, _LEAST_MARGIN, _ROUND = 0.25, 50, 10  # share, µs, µs
+
+
+@runtime_checkable
+class Person(Protocol):
+    """The person at the device; each method returns once the person, or a script, has done what was requested."""
+
+    def encoder_checked(self) -> bool:
+        """Whether the encoder is known to count up into the material; else the person is now asked to push it in."""
+        ...
+
+    def take_hands_off(self) -> None:
+        """No hand is on the handle. Raises `InputError` where nobody confirms that."""
+        ...
+
+    def place(self, moved_mm: float) -> float | None:
+        """Where the handle stands now, mm, after `moved_mm` since the start; None for a device that is homed."""
+        ...
+
+
+class Bounds(NamedTuple):
+    """What a nudge may be: its first and largest force (N), travel (mm), motor work (mJ), and impulse (N·s).
+
+    The device ends a nudge at half of the travel, and the other half is for the force to go: so the motor's work stays
+    below `work_mJ`. A larger force gets less travel and less time: an encoder that does not count is not pushed by
+    more than the impulse.
+    """
+
+    first_N: float = 0.3
+    most_N: float = 2.0
+    travel_mm: float = 0.5
+    work_mJ: float = 0.15
+    impulse_N_s: float = 0.015
+
+    def reach(self, force: float) -> float:
+        """Travel (mm) at which the device ends a nudge of this force (N)."""
+        return min(self.travel_mm, self.work_mJ / force) / 2
+
+    def lasts(self, force: float, device: Renderer) -> float:
+        """Time (s) in which this force (N), which rises at the slew limit, has the impulse; at least a tick."""
+        slew = device.device.slew_limit_N_per_s
+        rises = force / (2 * slew)
+        whole = self.impulse_N_s / force
+        seconds = whole + rises if whole >= rises else math.sqrt(2 * self.impulse_N_s / slew)
+        return max(math.floor(seconds / device.tick_s + 1e-6), 1) * device.tick_s
+
+    def forces(self, device: Renderer) -> list[float]:
+        """Forces (N) to try, rising, for this device's encoder and motor."""
+        bears = min(device.device.force_limit_N, device.condition().continuous_force_N)
+        told_apart = self.work_mJ / (2 * _FEWEST * device.device.encoder_step_mm)
+        most = min(self.most_N, bears, told_apart, self.impulse_N_s / device.tick_s)
+        forces = [min(self.first_N, most)]
+        while forces[-1] < most:
+            forces.append(min(_RAISE * forces[-1], most))
+        return forces
+
+
+class Nudge(NamedTuple):
+    """`force_N` has moved the handle by `moved_mm` (both positive inwards), with so much work of the motor (mJ)."""
+
+    force_N: float
+    moved_mm: float
+    work_mJ: float
+
+
+class Commissioned(NamedTuple):
+    """The nudges that moved the handle, friction, and the longest delay (µs) measured; `notes` for a person."""
+
+    nudges: tuple[Nudge, ...]
+    friction: Friction
+    longest_delay_us: int
+    notes: tuple[str, ...]
+
+
+def commission(
+    device: Renderer, person: Person, say: Callable[[str], None], bounds: Bounds | None = None, seed: int = 0
+) -> Commissioned:
+    """Signs, homing, delay, friction and damping of a device, in this order.
+
+    Raises `DeviceError` at the first thing that is wrong, and `InputError` where no person has confirmed what only a
+    person can see.
+    """
+    _check_ready(device)
+    start_mm = device.status().position_mm
+    if not person.encoder_checked():
+        say("waiting for a push by hand")
+        _check_encoder(device)
+        start_mm = device.status().position_mm
+    person.take_hands_off()
+    nudges = find_signs(device, say, bounds or Bounds())
+    if not device.can & Capability.HOMED_AT_BOOT:
+        _home(device, person, _rests(device) - start_mm)
+    say("delay")
+    notes = _heaviest_set(device)
+    drive(device, "force", "hold", 0.0, duration=_LASTS)
+    friction = measure_damping(device, say, seed)
+    return Commissioned(nudges, friction, _longest_delay(device), tuple(notes))
+
+
+def _check_ready(device: Renderer) -> None:
+    """Raises `DeviceError` for a device that cannot nudge, is not STOPPED, or is late already."""
+    name, status, condition = device.link.name, device.status(), device.condition()
+    if not device.can & Capability.DRIVE:
+        raise DeviceError(f"{name}: this device cannot move by itself; set HB_CAN_DRIVE in its capabilities.")
+    if condition.stop_open:
+        raise DeviceError(f"{name}: the hardware stop is open; close it, then `hilbo device clear`.")
+    if status.state != State.STOPPED:
+        raise DeviceError(
+            f"{name}: the device is {meaning(State, status.state)}: {held_because(status.hold_reason)}; find out why,"
+            " then `hilbo device clear`."
+        )
+    _check_delay(device)
+
+
+def _check_delay(device: Renderer) -> int:
+    """The longest delay since the device's start, µs. Raises `DeviceError` where it is longer than the device's own."""
+    condition = device.condition()
+    longest = condition.longest_delay_us
+    if longest > condition.delay_us:
+        raise DeviceError(
+            f"{device.link.name}: the device's delay_us of {condition.delay_us} is too short: a force came out"
+            f" {longest} us after its tick was due; set it to {delay_for(longest)} or more, then commission again."
+        )
+    return longest
+
+
+def _check_encoder(device: Renderer) -> None:
+    """Waits for a push by hand with the motor at rest. Raises `DeviceError` where the position falls by it."""
+    enough = max(_BY_HAND, 4 * device.device.encoder_step_mm)
+    before = device.samples(0.02).position_mm[-1]
+
+    def pushed() -> float | None:
+        moved = device.samples(0.02).position_mm[-1] - before
+        return moved if abs(moved) >= enough else None
+
+    moved = wait_until(device, pushed, f"seen a push by hand of {enough:g} mm", _PATIENCE)
+    if moved < 0:
+        _end_for_good(device)
+        raise DeviceError(
+            f"{device.link.name}: the encoder counts the wrong way: pushed in, its position fell by {-moved:.2f} mm;"
+            " swap its channels A and B, or change encoder_sign in the device's header, then commission again."
+        )
+
+
+def find_signs(device: Renderer, say: Callable[[str], None], bounds: Bounds) -> tuple[Nudge, ...]:
+    """One nudge inwards and one outwards that move the handle. Raises `DeviceError` at the first wrong sign."""
+    return tuple(_first_that_moves(device, say, bounds, sign) for sign in (1, -1))
+
+
+def _first_that_moves(device: Renderer, say: Callable[[str], None], bounds: Bounds, sign: int) -> Nudge:
+    forces, way = bounds.forces(device), "inwards" if sign > 0 else "outwards"
+    for force in forces:
+        say(f"nudge of {force:.2g} N {way}")
+        nudge = _nudge(device, sign * force, bounds)
+        if abs(nudge.moved_mm) < _FEWEST * device.device.encoder_step_mm:
+            continue
+        if nudge.moved_mm * sign > 0:
+            return nudge
+        _end_for_good(device)
+        raise DeviceError(
+            f"{device.link.name}: the motor pushes the wrong way: {force:.2g} N {way} moved the handle by"
+            f" {abs(nudge.moved_mm):.2f} mm the other way; swap the motor's two wires, or change motor_sign in the"
+            " device's header, then commission again."
+        )
+    raise DeviceError(
+        f"{device.link.name}: the handle did not move {way} at up to {forces[-1]:.2g} N; check the motor's supply, the"
+        " amplifier's enable and the encoder's cable, move the handle off its mechanical stop, or allow more with"
+        " --most-force."
+    )
+
+
+def _nudge(device: Renderer, force: float, bounds: Bounds) -> Nudge:
+    """One nudge from rest. Raises `DeviceError` where the device does not rest before, or is not STOPPED after it."""
+    steps = device.device
+    before = _rests(device)
+    reach = max(bounds.reach(abs(force)), _FEWEST * steps.encoder_step_mm)
+    device.samples(0.0)
+    device.drive("force", "nudge", force, reach, duration=bounds.lasts(abs(force), device))
+    wait_until(device, lambda: device.state() not in (State.DRIVING, State.STOPPING), "ended its nudge")
+    seen, status = device.samples(0.05), device.status()
+    if status.state != State.STOPPED:
+        raise DeviceError(
+            f"{device.link.name}: a nudge of {force:.2g} N ended in {meaning(State, status.state)}:"
+            f" {held_because(status.hold_reason)}; find out why, then commission again."
+        )
+    driving = np.flatnonzero(seen.flags & SampleFlag.DRIVING)
+    if not driving.size:
+        raise DeviceError(f"{device.link.name}: no telemetry of the nudge has come; check the line, then try again.")
+    moved = seen.position_mm[driving[0] :] - before
+    work = -np.sum(seen.force_N[:-1] * np.diff(seen.position_mm))  # force_N is positive outwards
+    return Nudge(force, float(moved[np.argmax(np.abs(moved))]), float(work))
+
+
+def _rests(device: Renderer) -> float:
+    """The position (mm) of a handle that has not moved for a while. Raises `DeviceError` where it goes on moving."""
+    step = device.device.encoder_step_mm
+
+    def position() -> tuple[float] | None:
+        seen = device.samples(_STILL).position_mm[-max(2, round(_STILL / device.tick_s / device.divisor)) :]
+        return (float(seen[-1]),) if np.ptp(seen) <= 1.01 * step else None
+
+    return wait_until(device, position, "come to rest by itself with its motor at rest", _REST)[0]
+
+
+def _end_for_good(device: Renderer) -> None:
+    """Latch the emergency stop: nothing moves until somebody clears it."""
+    device.estop()
+
+
+def _home(device: Renderer, person: Person, moved_mm: float) -> None:
+    position = person.place(moved_mm)
+    if position is not None:
+        device.home(position)
+        person.take_hands_off()
+
+
+def _heaviest_set(device: Renderer) -> list[str]:
+    """Put a soft set with the longest memory in force, so that ticks take as long as they can; a note where none is."""
+    low = {name: ends[0] for name, ends in device.limits().items()}
+    taps = device.device.most_taps - (device.device.most_taps + 1) % 2
+    K1, B1, alpha = max(low["K1"], 1e-3), max(low["B1"], 1e-3), max(low["alpha"], 0.2)
+    try:
+        device.send(K0=0.0, K1=K1, B1=B1, alpha=alpha, N=taps, T=device.tick_s, wait=_WAITS)
+    except RefusalError as error:
+        return [f"The delay was measured without a set in force, whose ticks take longer: {error}"]
+    return []
+
+
+def _longest_delay(device: Renderer) -> int:
+    """The longest delay since the device's start, µs. Raises `DeviceError` for a device that measures none."""
+    longest = _check_delay(device)
+    if longest == 0 and not device.can & Capability.SIMULATED:
+        raise DeviceError(
+            f"{device.link.name}: the device reports a delay of 0 us, which no motor has; measure it in its port"
+            " (input.delay_us), then commission again."
+        )
+    return longest
+
+
+def delay_for(longest_us: int) -> int:
+    """`delay_us` for a header: the longest that was measured and a quarter, 50 µs at least, rounded up to 10."""
+    return _ROUND * math.ceil((longest_us + max(_MARGIN * longest_us, _LEAST_MARGIN)) / _ROUND)
+
+
+def damping_for(friction: Friction) -> float:
+    """Damping (N·s/m) for a header: the lower end of the interval, rounded down to four digits; 0 where it is not
+    above 0."""
+    lower = friction.damping.lower
+    if not lower > 0:
+        return 0.0
+    least = 10.0 ** (math.floor(math.log10(lower)) - 3)
+    return math.floor(lower / least) * least

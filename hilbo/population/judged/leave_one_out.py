@@ -1,0 +1,258 @@
+"""Each person left out once: what a rule predicts of their answers, and how far that can be trusted.
+
+Each answer is predicted from the others' answers and from the person's own earlier ones. A session chooses renderings
+by these: predicted without them, "close" is given too often where it was asked for again, though the model is right.
+
+From the class probabilities of held-out answers come
+
+* the negative log predictive density, and the influence of each person: what leaving that person out does to a map;
+* the randomised probability integral transform u = F(q - 1) + v (F(q) - F(q - 1)), v uniform: uniform on [0, 1] for a
+  calibrated prediction, so that 95 % of the u lie in the central 95 %;
+* z^2, the mean squared normal score Phi^-1(u), 1 for a calibrated prediction, more for one that is too sure;
+* reliability: in bins of the predicted probability of a category, how often it was chosen.
+
+Answers of one person are not independent: errors are clustered by person.
+Reference: Czado, Gneiting & Held (2009), Biometrics 65:1254, for the transform of discrete data.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.special import ndtri
+
+from hilbo.errors import InputError
+from hilbo.kernels import gram
+from hilbo.numerics.host import placed
+from hilbo.numerics.rows import rows_of
+from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
+from hilbo.population.learnt.posterior import Stated
+from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.learnt.rule import Learnt, learn
+from hilbo.population.maps import RuleMap, learnt_map, rule_map
+from hilbo.population.newcomer import InTurn, predicted_in_turn
+
+__all__ = [
+    "LeftOut",
+    "calibration",
+    "clustered",
+    "influence",
+    "integral_transform",
+    "leave_one_out",
+    "leave_one_out_learnt",
+    "left_out_by",
+    "normal_scores",
+    "reliability",
+    "without",
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class LeftOut:
+    """Predictions of everybody's answers, each from all others' answers and the person's own earlier ones
+    (`newcomer.predicted_in_turn`), one row for each answer."""
+
+    person: Int[np.ndarray, " n"]
+    q: Int[np.ndarray, " n"]
+    probabilities: Float[np.ndarray, "n C"]
+    not_converged: int = 0
+    """Folds in which a fit did not hold its certificate."""
+    log_given: Float[np.ndarray, " n"] | None = None
+    """Log probability of each answer, finite where the probability is 0 in this precision; None: its logarithm."""
+
+    @property
+    def cost(self) -> Float[np.ndarray, " n"]:
+        """Negative log predictive density of each answer."""
+        if self.log_given is None:
+            return -np.log(self.probabilities[np.arange(len(self.q)), self.q])
+        return -self.log_given
+
+
+def without(trials: Trials, left: int | Int[np.ndarray, " k"]) -> Trials:
+    """Stacked trials without some people."""
+    rows = np.delete(np.arange(trials.mask.shape[0]), left)
+    return rows_of(trials, rows)
+
+
+def leave_one_out(
+    gp: OrdinalGP,
+    trials: Trials,
+    rule: str,
+    *,
+    share: Float[Array, ""] | None = None,
+    posteriors: Posterior | None = None,
+    inference: str = "laplace",
+    groups: Sequence[Int[np.ndarray, " _"]] | None = None,
+) -> tuple[LeftOut, list[RuleMap]]:
+    """What a rule predicts of each person's answers from all others' and their own earlier ones (hyperparameters and
+    share as given); and the maps without them; errors as in [`left_out_by`][]."""
+
+    def fold(left: Int[np.ndarray, " k"]) -> tuple[OrdinalGP, RuleMap]:
+        rest = np.delete(np.arange(trials.mask.shape[0]), left)
+        others = None if posteriors is None else rows_of(posteriors, rest)
+        given = without(trials, left)
+        return gp, rule_map(gp, given, rule, posteriors=others, share=share, inference=inference)
+
+    return left_out_by(trials, fold, groups)
+
+
+def leave_one_out_learnt(
+    learnt: Learnt,
+    trials: Trials,
+    stated: Stated,
+    *,
+    again: bool = True,
+    groups: Sequence[Int[np.ndarray, " _"]] | None = None,
+) -> tuple[LeftOut, list[RuleMap]]:
+    """The same by a recipe that learns, from what was learnt of everybody's answers.
+
+    **Arguments:** `stated`: what the study states; `again`: whether the hyperparameters are learnt again in each fold;
+    else those of all answers are kept, those of the person left out among them.
+    """
+    categories = learnt.model.thresholds.shape[0] + 1
+
+    def fold(left: Int[np.ndarray, " k"]) -> tuple[OrdinalGP, RuleMap]:
+        rest = eqx.tree_at(lambda t: t.mask, trials, trials.mask.at[left].set(False))  # all shapes stay
+        of_rest = learn(rest, categories, stated, RECIPES[learnt.recipe], learnt) if again else learnt
+        return of_rest.model.gp, learnt_map(of_rest, rest)
+
+    return left_out_by(trials, fold, groups)
+
+
+def left_out_by(
+    trials: Trials,
+    fold: Callable[[Int[np.ndarray, " k"]], tuple[OrdinalGP, RuleMap]],
+    groups: Sequence[Int[np.ndarray, " _"]] | None = None,
+) -> tuple[LeftOut, list[RuleMap]]:
+    """What `fold` predicts of people: the model and the map without those in some rows of the trials; each alone, or in
+    `groups`. Raises InputError for fewer than three people: two must be left to differ."""
+    people = trials.mask.shape[0]
+    if people < 3:
+        raise InputError(f"leave_one_out: {people} people; at least three are needed, of whom two are left each time.")
+    x, mask, q = np.asarray(trials.x), np.asarray(trials.mask), np.asarray(trials.q)
+    persons, categories, rows, logs, maps = [], [], [], [], []
+    for group in np.arange(people)[:, None] if groups is None else groups:
+        gp, map_without = fold(group)
+        maps.append(map_without)
+        for person in group:
+            context = None if trials.context is None else trials.context[person]
+            answers = placed(x[person]), trials.q[person], trials.mask[person], context
+            for part, values in zip((rows, logs), _newcomer(gp, map_without, *answers), strict=True):
+                part.append(np.asarray(values)[mask[person]])
+            persons.append(np.full(mask[person].sum(), person))
+            categories.append(q[person][mask[person]])
+    person, category, chances, log_given = (np.concatenate(part) for part in (persons, categories, rows, logs))
+    failed = sum(not _converged(map_) for map_ in maps)
+    return LeftOut(person, category.astype(int), chances, failed, log_given), maps
+
+
+def influence(whole: RuleMap, parts: list[RuleMap], x: Float[Array, "m d"]) -> Float[np.ndarray, " M"]:
+    """Root mean square change of the map's mean at x, in its standard deviations, when each person is left out."""
+    mean, variance = _predict(whole, x)
+    moved = [_predict(map_without, x)[0] - mean for map_without in parts]
+    return np.array([float(jnp.sqrt(jnp.mean(move**2 / variance))) for move in moved])
+
+
+def integral_transform(
+    probabilities: Float[np.ndarray, "n C"], q: Int[np.ndarray, " n"], seed: int = 0
+) -> Float[np.ndarray, " n"]:
+    """The randomised probability integral transform of answers q, (n,)."""
+    n = np.arange(len(q))
+    chance = probabilities[n, q]
+    below = np.cumsum(probabilities, axis=1)[n, q] - chance
+    return below + np.random.default_rng(seed).uniform(size=len(q)) * chance
+
+
+def normal_scores(
+    probabilities: Float[np.ndarray, "n C"], q: Int[np.ndarray, " n"], seed: int = 0
+) -> Float[np.ndarray, " n"]:
+    """Normal scores of the transform (n,), each from the smaller of its tails: finite in both."""
+    n, v = np.arange(len(q)), np.random.default_rng(seed).uniform(size=len(q))
+    chance = probabilities[n, q]
+    ranks = np.arange(probabilities.shape[1])[None, :]
+    below = np.sum(np.where(ranks < q[:, None], probabilities, 0.0), axis=1)
+    above = np.sum(np.where(ranks > q[:, None], probabilities, 0.0), axis=1)
+    lower, upper = below + v * chance, above + (1.0 - v) * chance
+    return np.where(lower < upper, 1.0, -1.0) * ndtri(np.minimum(lower, upper))
+
+
+def clustered(values: Float[np.ndarray, " n"], person: Int[np.ndarray, " n"]) -> tuple[float, float]:
+    """Mean of values, and its standard error where values of one person go together."""
+    mean, people = values.mean(), np.unique(person)
+    sums = np.array([np.sum(values[person == p] - mean) for p in people])
+    if len(people) < 2:
+        return float(mean), float("nan")
+    return float(mean), float(np.sqrt(len(people) / (len(people) - 1) * np.sum(sums**2)) / len(values))
+
+
+def calibration(left: LeftOut, seed: int = 0) -> dict[str, float]:
+    """Mean cost, share in the central 95 % and z^2, each with its error by person."""
+    u = integral_transform(left.probabilities, left.q, seed)
+    parts = {
+        "negative_log_density": left.cost,
+        "central_95": ((u > 0.025) & (u < 0.975)).astype(float),
+        "z2": normal_scores(left.probabilities, left.q, seed) ** 2,
+    }
+    content = {}
+    for name, values in parts.items():
+        content[name], content[f"{name}_error"] = clustered(values, left.person)
+    return content
+
+
+def reliability(left: LeftOut, bins: int = 10) -> list[dict[str, float]]:
+    """Predicted against observed: in bins of the probability of a category, over all answers and categories."""
+    chance = left.probabilities.ravel()
+    chosen = (left.q[:, None] == np.arange(left.probabilities.shape[1])[None, :]).ravel()
+    place = np.minimum((chance * bins).astype(int), bins - 1)
+    return [
+        {
+            "predicted": float(chance[place == b].mean()),
+            "observed": float(chosen[place == b].mean()),
+            "count": int((place == b).sum()),
+        }
+        for b in range(bins)
+        if (place == b).any()
+    ]
+
+
+@program
+def _predict(population_map: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    return population_map.predict(x)
+
+
+@program
+def _newcomer(
+    gp: OrdinalGP,
+    population_map: RuleMap,
+    x: Float[Array, "m d"],
+    q: Int[Array, " m"],
+    mask: Bool[Array, " m"],
+    context: Int[Array, " m"] | None,
+) -> InTurn:
+    """A new person's answers, one after the other. Their function has the map's mean and variance, and the kernel's
+    correlation; answers in one context of a random effect have what it adds in common."""
+    mean, variance = population_map.newcomer(x, context)
+    correlation, effects = _correlation(gram(gp.kernel, x, x)), population_map.effects
+    if effects is not None and context is not None:
+        apart = (1.0 - population_map.share) * population_map.prior
+        sd, of_context = jnp.sqrt(population_map.predict(x)[1] + apart), jnp.sqrt(effects.variance[context])
+        together = jnp.where(context[:, None] == context[None, :], jnp.outer(of_context, of_context), 0.0)
+        correlation = _correlation(correlation * jnp.outer(sd, sd) + together)
+    covariance = correlation * jnp.outer(jnp.sqrt(variance), jnp.sqrt(variance))
+    return predicted_in_turn(gp.likelihood, mean, covariance, q, mask, population_map.widths)
+
+
+def _correlation(covariance: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    sd = jnp.sqrt(jnp.diagonal(covariance))
+    return covariance / jnp.outer(sd, sd)
+
+
+def _converged(map_: RuleMap) -> bool:
+    """Whether every fit behind a map held its certificate."""
+    fits = map_.experts if map_.shared is None else map_.shared
+    assert fits is not None
+    return bool(np.all(np.asarray(fits.certificate.converged)))

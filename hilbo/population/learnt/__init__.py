@@ -1,0 +1,4 @@
+"""Recipes that learn the hyperparameters of the hierarchical model from all answers.
+
+A recipe's name is frozen, and so are its numbers.
+"""

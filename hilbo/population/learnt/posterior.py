@@ -1,0 +1,183 @@
+"""What a recipe maximises: the log posterior of the hyperparameters with its gradient, in their coordinates."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from hilbo.kernels import RBF, Levels, Stationary, theta_of
+from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import OrdinalGP
+from hilbo.population.learnt.recipes import LEARNT_1, Prior
+from hilbo.population.shared.features import Pivots
+from hilbo.population.shared.low_rank import shared_evidence
+from hilbo.population.shared.people_model import PeopleModel
+from hilbo.population.shared.tallies import Tallies
+
+__all__ = [
+    "LEFT",
+    "NOTHING",
+    "Coordinates",
+    "Cost",
+    "Problem",
+    "Stated",
+    "cost_at",
+    "every_theta",
+    "medians",
+    "model_at",
+    "prior_model",
+]
+
+Coordinates = dict[str, Float[Array, "..."]]
+LEFT = 1e-4
+"""Of the shared function's prior variance, what the search may leave: 2e-4 of the log evidence of 600 answers."""
+
+
+class Stated(NamedTuple):
+    """What a study file states of the model; None is learnt.
+
+    `theta`: of the coordinates that are numbers. `levels`: for each coordinate, None for numbers; nothing where all are
+    numbers. Their correlation stays where theta is stated, and else is the middle of what is believed before answers.
+    """
+
+    theta: tuple[float, ...] | None = None
+    variance: float | None = None
+    thresholds: tuple[float, ...] | None = None
+    noise: float | None = None
+    levels: tuple[Levels | None, ...] = ()
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What is stated, by its names in [gp]."""
+        return {name: value for name, value in self._asdict().items() if name != "levels" and value is not None}
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """For each coordinate its number of levels, 0 for numbers, as kernels take it."""
+        return tuple(0 if each is None else each.count for each in self.levels)
+
+
+NOTHING = Stated()
+
+
+class Problem(eqx.Module):
+    """What is given of a search."""
+
+    answers: Tallies
+    stated: Stated = eqx.field(static=True)
+    priors: Mapping[str, Prior]
+    kernel: type[Stationary] = eqx.field(static=True)
+    pivots: Pivots
+    """Of the shared function's features."""
+    theta: Float[Array, " d"]
+    """By which they were chosen."""
+
+
+class Cost(NamedTuple):
+    """Minus the log posterior of the hyperparameters and its gradient; and what was seen on the way."""
+
+    value: Float[Array, ""]
+    gradient: Coordinates
+    log_evidence: Float[Array, ""]
+    weights: Float[Array, "M n"]
+    usable: Bool[Array, ""]
+
+
+def every_theta(
+    kernel: type[Stationary], theta: tuple[float, ...], levels: tuple[Levels | None, ...]
+) -> tuple[float, ...]:
+    """One theta for each coordinate, from those of the numbers and from the correlations of levels."""
+    given = iter(theta)
+    return tuple(next(given) if each is None else theta_of(kernel, each.correlation) for each in levels) or theta
+
+
+def prior_model(dim: int, categories: int, stated: Stated = NOTHING) -> OrdinalGP:
+    """One person's model before any answer, by which sessions choose: what is stated, and the medians of the priors,
+    which all recipes have in common, with the RBF."""
+    nobody = Tallies(jnp.zeros((1, 1, dim)), jnp.zeros((1, 1, categories)))
+    return model_at(medians(nobody, stated, LEARNT_1.priors, RBF), nobody, stated, RBF).gp
+
+
+@program
+def cost_at(coordinates: Coordinates, start: Float[Array, "M n"], problem: Problem) -> Cost:
+    """At some coordinates; `start`: weights near which the mode is sought."""
+
+    def value(coordinates):
+        model = model_at(coordinates, problem.answers, problem.stated, problem.kernel)
+        evidence = shared_evidence(model, problem.answers, start, problem.pivots)
+        return -evidence.value - _log_prior(coordinates, problem), evidence
+
+    (cost, evidence), gradient = jax.value_and_grad(value, has_aux=True)(coordinates)
+    finite = jnp.all(jnp.isfinite(ravel_pytree(gradient)[0])) & jnp.isfinite(cost)
+    return Cost(cost, gradient, evidence.value, evidence.weights, evidence.arrived & finite)
+
+
+def medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior], kernel: type[Stationary]) -> Coordinates:
+    """Where the search begins: the medians of what is learnt."""
+    (people, _, d), categories, dtype = answers.x.shape, answers.counts.shape[-1], answers.x.dtype
+    every = {
+        "theta": jnp.full(d, priors["theta"].mean, dtype) - _lowered(stated, priors["theta"], kernel, d),
+        "shared": jnp.asarray(priors["shared"].mean, dtype),
+        "own": jnp.asarray(priors["own"].mean, dtype),
+        "middle": jnp.asarray(priors["middle"].mean, dtype),
+        "gaps": jnp.full(categories - 2, priors["gaps"].mean, dtype),
+        "widths": jnp.full(people, priors["widths"].mean, dtype),
+        "effect": jnp.asarray(priors["effect"].mean, dtype),
+    }
+    kept = {"theta"} if stated.theta is not None else set()
+    kept |= {"middle", "gaps"} if stated.thresholds is not None else set()
+    kept |= {"widths"} if categories < 3 else set()
+    kept |= {"effect"} if answers.context is None else set()
+    return {name: value for name, value in every.items() if name not in kept and value.size}
+
+
+def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated, kernel: type[Stationary]) -> PeopleModel:
+    """The hyperparameters at some coordinates, in units of the stated noise, or variance, or else of a noise of 1."""
+    (people, _, d), dtype = answers.x.shape, answers.x.dtype
+    shared, own = jnp.exp(coordinates["shared"]), jnp.exp(coordinates["own"])
+    noise = jnp.asarray(1.0 if stated.noise is None else stated.noise, dtype)
+    if stated.variance is not None:
+        scale = stated.variance / (shared + own)
+        noise = jnp.sqrt(scale) if stated.noise is None else noise
+        shared, own = scale * shared, scale * own
+    else:
+        shared, own = noise**2 * shared, noise**2 * own
+    if stated.theta is None:
+        theta = jnp.exp(coordinates["theta"])
+    else:
+        theta = jnp.broadcast_to(jnp.asarray(every_theta(kernel, stated.theta, stated.levels), dtype), (d,))
+    if stated.thresholds is None:
+        gaps = jnp.exp(coordinates["gaps"]) if "gaps" in coordinates else jnp.zeros(0, dtype)
+        edges = jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(gaps)])
+        thresholds = noise * (coordinates["middle"] + edges - jnp.mean(edges))
+    else:
+        thresholds = jnp.asarray(stated.thresholds, dtype)
+    widths = coordinates.get("widths", jnp.zeros(people, dtype))
+    effect = noise**2 * jnp.exp(coordinates["effect"]) if "effect" in coordinates else None
+    return PeopleModel(theta, shared, own, thresholds, noise, widths, kernel, stated.counts, effect)
+
+
+def _log_prior(coordinates: Coordinates, problem: Problem) -> Float[Array, ""]:
+    """Up to a constant."""
+    d = problem.answers.x.shape[-1]
+    total = jnp.zeros((), problem.answers.x.dtype)
+    for name, value in coordinates.items():
+        mean, sd = problem.priors[name]
+        lowered = _lowered(problem.stated, problem.priors[name], problem.kernel, d) if name == "theta" else 0.0
+        total -= 0.5 * jnp.sum(((value - mean + lowered) / sd) ** 2)
+    return total
+
+
+def _lowered(stated: Stated, prior: Prior, kernel: type[Stationary], d: int) -> Float[Array, "*d"]:
+    """By what the prior's mean of log theta is lowered: the logarithm of how many coordinates are numbers; of levels so
+    that its middle is their correlation."""
+    if not stated.levels:
+        return jnp.log(d)
+    numbers = sum(each is None for each in stated.levels)
+    by = (np.log(numbers) if e is None else prior.mean - np.log(theta_of(kernel, e.correlation)) for e in stated.levels)
+    return jnp.asarray(list(by))

@@ -1,0 +1,86 @@
+"""Recipes that learn the hyperparameters from all people's answers.
+
+Each has a name, and never changes: a study that names one gets the same numbers from a later hilbo, but for how near
+the search comes to the maximum, which is hundredths of a standard deviation. A better recipe gets another name.
+
+In units of the classification noise, with d parameters and C categories, people's functions and answers are those of
+`people_model.PeopleModel`. The priors of the hyperparameters:
+
+    coordinate                                   learnt-1            learnt-2
+    kernel                                       RBF                 Matern 3/2
+    log theta_i                                  log(24 / d), 1.2    the same
+    log shared variance                          log 3, 1            log 3, 2
+    log own variance                             0, 1                0, 2
+    middle of the thresholds                     0, 1.5              0, 4
+    log distance of neighbouring thresholds      log 0.8, 0.7        log 0.8, 2
+    log width_j of a person, if C > 2            0, 0.4              the same
+    log variance of a random effect, if any      0, 2                the same
+    largest at the optimum                       P(highest answer)   how often the best is near
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+from hilbo.kernels import RBF, Matern32, Stationary
+
+__all__ = ["EFFECT", "LEARNT_1", "LEARNT_2", "RECIPES", "RECOMMENDED", "WIDTHS", "Prior", "Recipe"]
+
+
+class Prior(NamedTuple):
+    """Normal, of one coordinate."""
+
+    mean: float
+    sd: float
+
+
+class Recipe(NamedTuple):
+    """What is learnt from answers, and how."""
+
+    name: str
+    kernel: type[Stationary]
+    """Of the function that people share, and of everybody's own part."""
+    priors: Mapping[str, Prior]
+    """By the names of `posterior.Coordinates`; that of theta less log d."""
+    centred: bool
+    """The optimum is the place that the best rendering is most often near (`study.best_places.nearness`), of those
+    where a new person gives the highest answer at most 0.05 less often than anywhere. False: where they do so most
+    often."""
+
+
+WIDTHS: Final = Prior(0.0, 0.4)
+"""Of the logarithm of a person's distances between thresholds, about their middle."""
+EFFECT: Final = Prior(0.0, 2.0)
+"""Of the logarithm of the variance of what a context adds, as far as a study names a random effect."""
+
+LEARNT_1: Final = Recipe(
+    "learnt-1",
+    RBF,
+    {
+        "theta": Prior(math.log(24.0), 1.2),
+        "shared": Prior(math.log(3.0), 1.0),
+        "own": Prior(0.0, 1.0),
+        "middle": Prior(0.0, 1.5),
+        "gaps": Prior(math.log(0.8), 0.7),
+        "widths": WIDTHS,
+        "effect": EFFECT,
+    },
+    centred=False,
+)
+LEARNT_2: Final = Recipe(
+    "learnt-2",
+    Matern32,
+    {
+        "theta": Prior(math.log(24.0), 1.2),
+        "shared": Prior(math.log(3.0), 2.0),
+        "own": Prior(0.0, 2.0),
+        "middle": Prior(0.0, 4.0),
+        "gaps": Prior(math.log(0.8), 2.0),
+        "widths": WIDTHS,
+        "effect": EFFECT,
+    },
+    centred=True,
+)
+RECIPES: Final = {recipe.name: recipe for recipe in (LEARNT_1, LEARNT_2)}
+RECOMMENDED: Final = LEARNT_2.name
+"""What is shown beside a study's own rule."""

@@ -1,0 +1,147 @@
+"""What everybody's answers say of the shared function g, and of the random effect of contexts, by `low_rank`."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array, Float, Int
+
+from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
+from hilbo.kernels import Stationary, gram
+from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.linalg import eigh
+from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
+from hilbo.population.shared.features import Pivots, root_of_pivots
+from hilbo.population.shared.low_rank import System, evidence_at, mode_of, prior_of
+from hilbo.population.shared.people_model import PeopleModel
+from hilbo.population.shared.tallies import Tallies
+
+__all__ = ["ContextEffects", "SharedFunction", "shared_function"]
+
+
+class ContextEffects(eqx.Module):
+    """The posterior of what each of c contexts adds to everybody's function, and its covariance with g."""
+
+    prior: Float[Array, ""]
+    """Variance of what a context adds that nobody was asked in."""
+    mean: Float[Array, " c"]
+    variance: Float[Array, " c"]
+    kernel: Stationary
+    """Of g."""
+    points: Float[Array, "r d"]
+    cross: Float[Array, "r c"]
+    """k(x, points) times it is the covariance of g(x) with the effects."""
+
+    def added(self, x: Float[Array, "m d"], context: Int[Array, " m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """By what the mean and the variance (m,) of g(x) change in these contexts."""
+        together = jnp.sum(gram(self.kernel, x, self.points) * self.cross[:, context].T, axis=1)
+        return self.mean[context], self.variance[context] + 2.0 * together
+
+
+class SharedFunction(NamedTuple):
+    """What everybody's answers say."""
+
+    function: Posterior
+    """Of g; a random effect is integrated out."""
+    effects: ContextEffects | None
+    """Of a model with a random effect."""
+
+
+@program
+def shared_function(model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], pivots: Pivots) -> SharedFunction:
+    """Posterior of the shared function g, as a GP of its prior that was asked at the pivots, and of the random effect;
+    arguments as those of `shared_evidence`.
+
+    What all answers say of g goes through its weights w, of precision S and mean F'a: with L L' = k(Z, Z) the mean is
+    k(x, Z) L^-T w and k(x, Z) L^-T (I - S^-1) L^-1 k(Z, x) of the prior variance is explained. Never raises: read
+    `certificate.converged`.
+    """
+    rank = len(pivots.points)
+    prior = prior_of(model, answers, pivots)
+    mode = mode_of(model, answers, prior, start)
+    value, system = evidence_at(model, answers, prior, mode.weights)
+    # One step more changes the evidence by what is left of the way, or more.
+    error = jnp.abs(evidence_at(model, answers, prior, mode.further)[0] - value)
+
+    root = jnp.sqrt(model.shared) * root_of_pivots(model.unit, pivots)
+    together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
+    weights = jnp.where(pivots.used, solve_triangular(root, together[:rank], lower=True, trans=1), 0.0)
+    factor = jnp.where(pivots.used[None, :], _explained(_without_effect(system.precision, rank), root), 0.0)
+
+    kernel = model.of_variance(model.shared)
+    covariance = gram(kernel, pivots.points, pivots.points)
+    smallest = jnp.min(jnp.diagonal(covariance) - jnp.sum((factor @ covariance) ** 2, axis=0))
+    resolution = jnp.finfo(root.dtype).eps * model.shared * root.shape[0] ** 0.5
+    rounding = _rounding(model, answers, mode.weights, covariance, weights)
+    known_well = evidence_known(value, error, rounding) & (smallest >= resolution)
+    certificate = Certificate(
+        residual=mode.residual,
+        tolerance=mode.tolerance,
+        iterations=mode.steps,
+        jitter=pivots.left,
+        condition=jnp.linalg.norm(system.precision),
+        smallest_variance=smallest,
+        variance_resolution=resolution,
+        evidence_error=error,
+        evidence_tolerance=evidence_tolerance(value),
+        evidence_rounding=rounding,
+        converged=(mode.residual <= mode.tolerance) & known_well,
+    )
+    latent = GaussianPosterior(covariance @ weights, weights, factor, factor.T @ factor, value, certificate)
+    asked = Trials(pivots.points, jnp.zeros(rank, jnp.int32), pivots.used)
+    function = Posterior(OrdinalGP(kernel, OrdinalProbit(model.thresholds, model.noise)), asked, latent)
+    return SharedFunction(function, _effects_of(model, system, together, pivots.points, root))
+
+
+def _effects_of(
+    model: PeopleModel,
+    system: System,
+    together: Float[Array, " p"],
+    points: Float[Array, "r d"],
+    root: Float[Array, "r r"],
+) -> ContextEffects | None:
+    """The weights of g and those of the effect are of the covariance S^-1 and the mean F'a, which is `together`."""
+    if model.effect is None:
+        return None
+    rank, sd = len(points), jnp.sqrt(model.effect)
+    covariance = cho_solve((system.factor, True), jnp.eye(len(together), dtype=together.dtype))
+    return ContextEffects(
+        prior=model.effect,
+        mean=sd * together[rank:],
+        variance=model.effect * jnp.diagonal(covariance)[rank:],
+        kernel=model.of_variance(model.shared),
+        points=points,
+        cross=sd * solve_triangular(root, covariance[:rank, rank:], lower=True, trans=1),
+    )
+
+
+def _without_effect(precision: Float[Array, "p p"], rank: int) -> Float[Array, "r r"]:
+    """The precision of the weights of g, those of the effect integrated out."""
+    if precision.shape[0] == rank:
+        return precision
+    cross, own = precision[:rank, rank:], precision[rank:, rank:]
+    half = solve_triangular(jnp.linalg.cholesky(own), cross.T, lower=True)
+    return precision[:rank, :rank] - half.T @ half
+
+
+def _explained(precision: Float[Array, "r r"], root: Float[Array, "r r"]) -> Float[Array, "r r"]:
+    """V with V'V = L^-T (I - S^-1) L^-1, of S and L."""
+    excess, vectors = eigh(precision - jnp.eye(root.shape[0], dtype=root.dtype))
+    explained = jnp.sqrt(jnp.where(excess > 0, excess / (1.0 + excess), 0.0))  # below 0 by rounding
+    return explained[:, None] * solve_triangular(root, vectors, lower=True, trans=1).T
+
+
+def _rounding(
+    model: PeopleModel,
+    answers: Tallies,
+    weights: Float[Array, "M n"],
+    covariance: Float[Array, "r r"],
+    of_pivots: Float[Array, " r"],
+) -> Float[Array, ""]:
+    """What the rounding of everybody's own covariances, and of g's, does to the log evidence."""
+    kernel = model.of_variance(model.own)
+    of_people = jax.lax.map(lambda p: evidence_rounding(gram(kernel, p[0], p[0]), p[1][None, :]), (answers.x, weights))
+    return jnp.linalg.norm(of_people) + evidence_rounding(covariance, of_pivots[None, :])

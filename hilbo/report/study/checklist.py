@@ -1,0 +1,127 @@
+"""A checklist of Bayesian reporting, filled in with what hilbo knows, and with a line for what only the authors know.
+
+The items follow those of Kruschke (2021), Bayesian Analysis Reporting Guidelines, Nature Human Behaviour 5:1282-1291,
+in our own words.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hilbo.report.kernel_words import covariance_words, formula
+from hilbo.report.page import number, percent
+from hilbo.report.registration import sought
+from hilbo.study.analysis.analysis import Analysis
+
+__all__ = ["Item", "checklist"]
+
+_OPEN = "To be written by you: "
+_APPROXIMATIONS = {
+    "laplace": "a Gaussian at the posterior's mode (Laplace)",
+    "ep": "expectation propagation",
+    "ep_corrected": "expectation propagation with corrections",
+    "exact": "independent draws of the exact posterior",
+}
+
+
+class Item(NamedTuple):
+    """What a reader asks, and the answer: `known` from the files, `to_write` by the authors (either may be empty)."""
+
+    question: str
+    known: str
+    to_write: str
+
+
+def checklist(analysis: Analysis, content: dict[str, Any], validated: bool) -> list[Item]:
+    """The items of one material; `content`: its part of result.json; `validated`: whether people were asked again."""
+    return [
+        Item("Goal", "", f"{_OPEN}what is to be found out, and why by a Bayesian analysis."),
+        Item("Data", _data(analysis), ""),
+        Item("Model and prior", _model(analysis), f"{_OPEN}why these hyperparameters are plausible beforehand."),
+        Item("Prior prediction", _prior(analysis), ""),
+        Item("Computation", _computation(analysis, content), ""),
+        Item("Posterior", _posterior(analysis, content), ""),
+        Item("Posterior prediction", _prediction(content, validated), ""),
+        Item("Decisions", "No hypothesis is accepted or rejected by a bound on this page.", _decisions(analysis)),
+        Item("Sensitivity", _sensitivity(content), ""),
+        Item(
+            "Reproducibility",
+            f"study {content['study']}, seed {content['seed']}, hilbo {content['versions']['hilbo']}; dictionary.csv"
+            " explains every column, map.nc and inference.nc hold map and posterior.",
+            f"{_OPEN}where study file, tables and logs can be had.",
+        ),
+    ]
+
+
+def _data(analysis):
+    counts, study = analysis.cohort.counts(), analysis.study
+    many = f"{counts.min()}" if counts.min() == counts.max() else f"{counts.min()} to {counts.max()}"
+    return (
+        f"{len(counts)} participants, {many} answers each ({', '.join(study.responses)}) on {study.attribute}, over"
+        f" {', '.join(study.space.names)}; left out by the rule stated before: {len(analysis.left_out)}."
+    )
+
+
+def _model(analysis):
+    study, gp = analysis.study, analysis.study.gp
+    given = "as the study file states" if study.learnt is None else "learnt from these answers by a fixed recipe"
+    return (
+        f"Ordinal probit likelihood on a latent Gaussian process with a {covariance_words(gp.kernel)} covariance of the"
+        f" normalised parameters, {formula(gp.kernel)}; thresholds {_each(gp.likelihood.thresholds)}, noise"
+        f" {_each(gp.likelihood.noise)}; all {given}; people aggregated by the rule {study.rule}"
+        + (f", with a random effect of {study.random_effect}." if analysis.aggregate.map.effects else ".")
+    )
+
+
+def _prior(analysis):
+    gp = analysis.study.gp
+    chances = np.asarray(gp.likelihood.class_probabilities(np.zeros(()), np.asarray(gp.kernel.variance)))
+    shares = ", ".join(f"{label} {percent(p)}" for label, p in zip(analysis.study.responses, chances, strict=True))
+    return f"Before any answer the model predicts {shares}, everywhere."
+
+
+def _computation(analysis, content):
+    certificates = [person["certificate"] for person in content["participants"]]
+    good = sum(bool(c["converged"]) for c in certificates)
+    return (
+        f"Each posterior by {_APPROXIMATIONS[content['inference']]}; {good} of {len(certificates)} fits reached their"
+        " tolerance (certificates in result.json)."
+    )
+
+
+def _posterior(analysis, content):
+    best = content["optimum"]
+    where = ", ".join(f"{name} {number(value)}" for name, value in best["parameters"].items())
+    return (
+        f"The optimum is, among what may be presented, {sought(analysis.study.rule)}: {where}; latent score"
+        f" {best['mean']:.2f} ± {best['sd']:.2f} (standard deviation); tolerance intervals with bootstrap resamples of"
+        " the people above."
+    )
+
+
+def _prediction(content, validated):
+    check = content["model_check"]
+    if check is None:
+        return "Too few participants to leave one out."
+    costs = check["negative_log_density"]
+    again = "Validation sessions asked people again." if validated else "Nobody was asked again."
+    return (
+        f"Leave-one-participant-out: {costs['map']:.3f} nats an answer by this map and the participant's earlier"
+        f" answers, {costs['constant']['cost']:.3f} by the same shares everywhere. {again}"
+    )
+
+
+def _decisions(analysis):
+    return f"{_OPEN}what is decided by these results, by which bound, and whether it was set before."
+
+
+def _sensitivity(content):
+    parts = [f"hyperparameters of maximum evidence move the optimum by {percent(content['optimised']['nrmse'], 1)}"]
+    if "other_inference" in content:
+        other = content["other_inference"]
+        parts.append(f"inference by {other['inference']} by {percent(other['nrmse'], 1)}")
+    return f"Of the search ranges: {'; '.join(parts)}; other rules stand among the alternative estimates."
+
+
+def _each(values: Any) -> str:
+    return ", ".join(f"{float(v):.4g}" for v in np.ravel(np.asarray(values)))

@@ -1,0 +1,77 @@
+"""Every rule of aggregation beside the study's: comparison.json, comparison.csv, figures, and a section of the page."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from hilbo.report.page import Pictures, heads, number, percent
+from hilbo.report.participants import as_json
+from hilbo.report.results import save_figures
+from hilbo.study.analysis.rule_comparison import KNOWN, compare
+from hilbo.study.config import Study
+from hilbo.study.estimate.aggregate import Aggregate
+
+__all__ = ["Compared", "comparison_section", "comparison_table", "write_comparison"]
+
+_COLUMNS = ("method", "negative_log_density", "negative_log_density_error", "difference", "difference_error")
+_COLUMNS += ("central_95", "central_95_error", "z2", "covered", "optimum_sd")
+
+
+class Compared(NamedTuple):
+    """A comparison of rules: as data, as a section of the page, and its figures."""
+
+    content: dict[str, Any]
+    section: dict[str, Any]
+    pictures: Pictures
+
+
+def write_comparison(study: Study, aggregate: Aggregate, folder: Path, seed: int = 0) -> Compared:
+    """Compare all rules and write comparison.json, comparison.csv and the figures into the folder."""
+    from hilbo.report.figures import population as plotting
+
+    content = compare(study, aggregate, seed)
+    (folder / "comparison.json").write_text(as_json(content))
+    comparison_table(content).to_csv(folder / "comparison.csv", index=False)
+    best, prior = np.asarray(aggregate.optimum.x), float(aggregate.map.map_prior)
+    figures = {
+        "comparison": plotting.rules_figure(content),
+        "reliability": plotting.reliability_figure(content),
+        "coverage": plotting.coverage_figure(study, aggregate.surface, best, prior, KNOWN),
+    }
+    return Compared(content, comparison_section(study, content), save_figures(figures, folder))
+
+
+def comparison_table(content: dict[str, Any]) -> pd.DataFrame:
+    """A row for each rule."""
+    rows = []
+    for rule, entry in content["rules"].items():
+        row = {"rule": rule} | {name: entry.get(name) for name in _COLUMNS} | entry.get("optimum", {})
+        influence = entry.get("influence") or {}
+        row["most_influential"] = max(influence, key=lambda name: influence[name]) if influence else None
+        rows.append(row | {"refused": entry.get("refused")})
+    return pd.DataFrame(rows)
+
+
+def comparison_section(study: Study, content: dict[str, Any]) -> dict[str, Any]:
+    """What the page shows: `words`, `head` and `rows` of the table, best first, and who was `refused`, with reason."""
+    rules = content["rules"]
+    compared = {rule: entry for rule, entry in rules.items() if "refused" not in entry}
+    order = sorted(compared, key=lambda rule: compared[rule]["negative_log_density"])
+    names = list(compared[order[0]]["optimum"])
+    head = ["rule", "negative log density", "difference", "in central 95 %", "mean square normal score (1: calibrated)"]
+    head += [f"space where sd < {percent(KNOWN)} of the prior's", "sd at the optimum", *heads(study, names)]
+    return {
+        "words": content["recommendation"],
+        "head": head,
+        "rows": [[rule, *_cells(compared[rule])] for rule in order],
+        "refused": [f"{rule}: {entry['refused']}" for rule, entry in rules.items() if "refused" in entry],
+    }
+
+
+def _cells(entry):
+    best = entry["difference"] == 0.0
+    difference = "" if best else f"{entry['difference']:+.3f} ± {entry['difference_error']:.3f}"
+    cells = [f"{entry['negative_log_density']:.3f}", difference, percent(entry["central_95"]), f"{entry['z2']:.2f}"]
+    return [*cells, percent(entry["covered"]), f"{entry['optimum_sd']:.2f}", *map(number, entry["optimum"].values())]

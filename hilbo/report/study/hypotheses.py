@@ -1,0 +1,255 @@
+"""What a study's results say of the paper's hypotheses H1 to H4, item by item.
+
+Every item is a sentence with its figures, and whether it supports the hypothesis, contradicts it, or is inconclusive.
+The bounds are stated in the sentence; what ties with its bound is inconclusive, so that a verdict does not depend on
+which end of a scale is written first. Items are not counted, and none is a test of its own. Only a study that asks for
+it has this section (`[report] hypotheses = true`): the hypotheses are the paper's, not everybody's.
+
+    H1  individuals' parameters can be found by asking      H3  individuals need not have converged for that
+    H2  a population's map has an optimum that people share  H4  it holds for other materials
+
+The page has the hypotheses in full.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from hilbo.report.results import misses
+from hilbo.report.validation import Validated, safest
+from hilbo.study.analysis.analysis import Analysis
+from hilbo.study.analysis.heterogeneity import in_place
+
+__all__ = ["Evidence", "Hypothesis", "Results", "hypotheses"]
+
+Side = Literal["supports", "contradicts", "inconclusive"]
+_NEAR = 0.05
+_SAME = 1e-9  # rounding: numbers that are as near as this are equal
+
+
+class Results(NamedTuple):
+    """What is known of one material."""
+
+    name: str
+    analysis: Analysis
+    validated: Validated | None
+    reference: np.ndarray | None
+    reference_name: str
+
+
+class Evidence(NamedTuple):
+    """One item."""
+
+    side: Side
+    text: str
+
+
+class Hypothesis(NamedTuple):
+    """A hypothesis and its evidence."""
+
+    number: str
+    evidence: tuple[Evidence, ...]
+
+
+def hypotheses(results: Sequence[Results]) -> list[Hypothesis]:
+    """H1 to H3 by the first material, H4 by the others."""
+    first = results[0]
+    return [
+        Hypothesis("H1", tuple(_individuals(first))),
+        Hypothesis("H2", tuple(_population(first))),
+        Hypothesis("H3", tuple(_convergence(first))),
+        Hypothesis("H4", tuple(_materials(results))),
+    ]
+
+
+def _side(one: float, other: float) -> Side:
+    """Whether one is more than the other, which supports; equal ones say nothing, nor does what is not known."""
+    if np.isclose(one, other, rtol=_SAME, atol=_SAME) or np.isnan(one) or np.isnan(other):
+        return "inconclusive"
+    return "supports" if one > other else "contradicts"
+
+
+def _largest(row: np.ndarray, place: int) -> Side:
+    """Whether the number at a place is larger than all others of its row."""
+    return _side(float(row[place]), float(np.delete(row, place).max()))
+
+
+def _individuals(results):
+    analysis, study = results.analysis, results.analysis.study
+    counts = analysis.progress.counts
+    top, people = study.responses[-1], len(analysis.cohort.names)
+    if analysis.progress.splits and len(counts) > 2:
+        yield _nearer_to_others(analysis.progress)
+    answers = np.asarray(analysis.cohort.trials.q) == len(study.responses) - 1
+    mask = np.asarray(analysis.cohort.trials.mask)
+    totals = (answers & mask).sum(axis=1)
+    spread = f" ± {totals.std(ddof=1):.2f}" if people > 1 else ""
+    longest = int(analysis.cohort.counts().max())
+    third = max(longest // 3, 1)
+    early, late = (
+        float((answers & mask)[:, columns].sum() / max(mask[:, columns].sum(), 1))
+        for columns in (slice(0, third), slice(longest - third, longest))
+    )
+    yield Evidence(
+        _side(late, early) if longest >= 6 else "inconclusive",
+        f'Of {longest} trials, {totals.mean():.2f}{spread} were answered "{top}"; in the first third of the session'
+        f" {100 * early:.0f} % of the answers, in the last third {100 * late:.0f} % (supports: more than in the"
+        " first).",
+    )
+    chances = np.asarray(analysis.aggregate.individuals.class_probabilities)
+    sides = [_largest(row, -1) for row in chances]
+    likeliest, unlike = sides.count("supports"), sides.count("contradicts")
+    yield Evidence(
+        "supports" if likeliest > people / 2 else "contradicts" if unlike > people / 2 else "inconclusive",
+        f'At their own optimum "{top}" is the likeliest answer for {likeliest} of {people} participants (median'
+        f" probability {100 * np.median(chances[:, -1]):.0f} %; supports: more than half of them).",
+    )
+
+
+def _nearer_to_others(progress):
+    """Whether individual optima come nearer to those of people who are not among them."""
+    row = _early(progress.counts)
+    early, late = (100 * progress.individual_to_half[k] for k in (row, -1))
+    nearer = early - late
+    error = nearer.std(ddof=1) / np.sqrt(len(nearer))
+    side: Side = (
+        "supports" if nearer.mean() > 2 * error else "contradicts" if nearer.mean() < -2 * error else "inconclusive"
+    )
+    return Evidence(
+        side,
+        f"From the optimum of a half of the people without them, individual optima are {np.median(early):.0f} % away"
+        f" after {progress.counts[row]} trials and {np.median(late):.0f} % after {progress.counts[-1]} (NRMSE,"
+        f" medians); they come nearer by {nearer.mean():.1f} ± {error:.1f} %"
+        " (supports: by more than two standard errors).",
+    )
+
+
+def _early(counts):
+    """The row of the first third of the trials."""
+    return int(np.searchsorted(counts, max(int(counts[-1]) // 3, 1)))
+
+
+def _population(results):
+    analysis, study = results.analysis, results.analysis.study
+    best = analysis.aggregate.optimum
+    if results.reference is not None:
+        ours, _ = misses(study, best.x, results.reference)
+        individual_misses, _ = misses(study, analysis.aggregate.individuals.x, results.reference)
+        mean, _ = misses(study, analysis.aggregate.mean_of_optima, results.reference)
+        low, middle, high = np.percentile(individual_misses, [25, 50, 75])
+        yield Evidence(
+            _side(min(float(middle), float(mean)), float(ours)),
+            f"From {results.reference_name} the population optimum is {100 * ours:.1f} % away (NRMSE), the individual"
+            f" optima {100 * middle:.0f} % (median; quartiles {100 * low:.0f} and {100 * high:.0f} %), their mean"
+            f" {100 * mean:.1f} % (supports: nearer than both the median and the mean).",
+        )
+    p = float(best.class_probabilities[-1])
+    yield Evidence(
+        _largest(np.asarray(best.class_probabilities), -1),
+        f'At the population optimum the map gives "{study.responses[-1]}" a probability of {100 * p:.0f} %'
+        " (supports: the likeliest answer).",
+    )
+    if results.validated is None:
+        yield Evidence("inconclusive", "No validation session asked people again.")
+        return
+    yield from _validation(results.validated, study.responses)
+
+
+def _validation(validated, responses):
+    counts = validated.tables.confusion.to_numpy()
+    if len(counts) == 3 and counts.sum(axis=1).all() and len(responses) == 3:
+        sides = [_largest(row, place) for place, row in enumerate(counts)]
+        yield Evidence(
+            "contradicts" if "contradicts" in sides else "inconclusive" if "inconclusive" in sides else "supports",
+            f'Best, mid and worst were called "{responses[-1]}", "{responses[1]}" and "{responses[0]}" in'
+            f" {', '.join(f'{100 * v:.0f} %' for v in np.diagonal(counts) / counts.sum(axis=1))} of the cases"
+            " (supports: each is the most frequent answer to its set).",
+        )
+    for number, term, words, sign in (
+        ("II", "Best", f'the best set is called "{responses[-1]}" more often than the others', 1),
+        ("III", "Best", "the best set differs from the mid set, towards the highest answer", -1),
+        ("III", "Worst", "the worst set differs from the mid set, towards the lowest answer", 1),
+        ("IV", "Aggregate-Best", "the aggregate's set is preferred to individuals' own", 1),
+    ):
+        table = validated.regressions().get(number)
+        if table is None:
+            continue
+        rows = safest(table).set_index("term")
+        if term not in rows.index:
+            continue
+        low, high = sorted((sign * rows.at[term, "low"], sign * rows.at[term, "high"]))
+        side: Side = "supports" if low > 0 else "contradicts" if high < 0 else "inconclusive"
+        yield Evidence(
+            side,
+            f"Table {number}, {term}: {rows.at[term, 'estimate']:.2f}, 95 % interval {rows.at[term, 'low']:.2f} to"
+            f" {rows.at[term, 'high']:.2f}; {'' if low > 0 else 'it does not show that '}{words}.",
+        )
+
+
+def _convergence(results):
+    analysis = results.analysis
+    progress = analysis.progress
+    if len(progress.counts) <= 2 or not progress.splits:
+        yield Evidence("inconclusive", "It takes several participants and trials to say.")
+        return
+    how = in_place(analysis.aggregate.map)
+    how = f" (aggregated {how})" if how else ""
+    row = _early(progress.counts)
+    half, end, individual = (
+        100 * float(np.median(v)) for v in (progress.halves[row], progress.halves[-1], progress.individual_to_half[row])
+    )
+    yield Evidence(
+        _side(individual, half),
+        f"After {progress.counts[row]} trials the optimum of one half of the people{how} is {half:.0f} % (NRMSE,"
+        f" median of {progress.splits} random halves) from that of the other half after all trials, and individual"
+        f" optima are {individual:.0f} % from it (supports: the half nearer than the individuals); after all trials the"
+        f" halves are {end:.0f} % apart.",
+    )
+    if results.reference is not None:
+        miss = [
+            float(misses(analysis.study, x, results.reference)[0])
+            for x in (analysis.progress.population[row], analysis.progress.population[-1])
+        ]
+        yield Evidence(
+            "supports" if miss[0] <= miss[1] + _NEAR else "contradicts",
+            f"The optimum of everybody's first {progress.counts[row]} answers is {100 * miss[0]:.1f} % from"
+            f" {results.reference_name}, that of all {100 * miss[1]:.1f} %{how}"
+            f" (supports: at most {100 * _NEAR:.0f} % more).",
+        )
+
+
+def _materials(results):
+    if len(results) < 2:
+        yield Evidence("inconclusive", "One material was studied.")
+    for one in results[1:]:
+        items = [*_near(one), *([] if one.validated is None else _preferred(one.name, one.validated))]
+        words = f"{one.name}: there is no reference, and no decided comparison of the map's set with individuals'."
+        yield from items or [Evidence("inconclusive", words)]
+
+
+def _near(one):
+    if one.reference is None:
+        return
+    analysis = one.analysis
+    ours = float(misses(analysis.study, analysis.aggregate.optimum.x, one.reference)[0])
+    individual_miss = float(np.median(misses(analysis.study, analysis.aggregate.individuals.x, one.reference)[0]))
+    yield Evidence(
+        _side(individual_miss, ours),
+        f"{one.name}: the population optimum is {100 * ours:.1f} % from {one.reference_name}, the median individual one"
+        f" {100 * individual_miss:.0f} % (supports: nearer than that).",
+    )
+
+
+def _preferred(name, validated):
+    table = validated.regressions().get("IV")
+    if table is None or validated.overall is None:
+        return
+    row = safest(table).set_index("term").loc["Aggregate-Best"]
+    side: Side = "supports" if row["low"] > 0 else "contradicts" if row["high"] < 0 else "inconclusive"
+    yield Evidence(
+        side,
+        f"{name}: the aggregate's set was preferred in {100 * validated.overall['rate'].iloc[0]:.1f} % of the decided"
+        f" comparisons ({int(validated.people['ties'].sum())} ties; table IV: {row['estimate']:.2f}, 95 % interval"
+        f" {row['low']:.2f} to {row['high']:.2f}).",
+    )

@@ -1,0 +1,290 @@
+"""`hilbo report`: a folder of sessions as one page, in the paper's order, with figures (SVG, PNG) and tables (CSV).
+
+Each material gets its figures 4 to 8 and tables I to IV, its limits, its people and the passivity of every optimum;
+hypotheses H1 to H4 get a section each (`hilbo.report.study.hypotheses`). With several materials the files of each lie
+in a folder of its name. result.json holds everything by number, `inference.nc` the posterior for ArviZ, `map.nc` the
+population map.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hilbo.population.learnt.recipes import RECIPES
+from hilbo.report import validation
+from hilbo.report.page import Pictures, estimate_words, heads, number, percent, rendered
+from hilbo.report.participants import people_of
+from hilbo.report.results import as_json, optima_table, result, save_figures, versions
+from hilbo.report.study.checklist import checklist
+from hilbo.report.study.comparison import comparison_section, comparison_table
+from hilbo.report.study.dictionary import dictionary
+from hilbo.report.study.hypotheses import Results, hypotheses
+from hilbo.report.study.result_tables import alternatives_table, convergence_table, table_1, tolerance_table
+from hilbo.report.study.study_figures import comparison_figures, study_figures
+from hilbo.report.validation import Validated, folder_names, named_warnings, validate
+from hilbo.study.analysis.analysis import Analysis, analyse, moved_by_evidence
+from hilbo.study.analysis.heterogeneity import in_place
+from hilbo.study.analysis.rule_comparison import compare
+from hilbo.study.config import Study
+from hilbo.study.file.trial_flags import flag_sentences
+from hilbo.study.folder import Material, StudyFolder
+from hilbo.study.results.arviz_groups import groups, predictive_shares, write_groups
+from hilbo.study.results.map_netcdf import map_dataset, write_map
+from hilbo.study.tables.parameter_sets import ROLES
+
+__all__ = ["write_study"]
+
+_DIGITS = 2  # of measures of people and of ends of intervals, which a few dozen answers decide
+_FEWEST = 3  # people for a comparison of rules: each is left out in turn; parts.html says three
+
+
+def write_study(
+    folder: StudyFolder,
+    out: Path,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda text: None,
+    analyses: Mapping[str, Analysis] | None = None,
+    comparison: bool = True,
+) -> dict[str, Any]:
+    """Write the results folder of `hilbo report`; returns the content of result.json.
+
+    `analyses`: of materials (by name) whose results are known already. `comparison`: every rule of aggregation with
+    each person left out in turn, which is most of the work.
+    """
+    results, contents, sections = [], {}, []
+    analyses = {} if analyses is None else analyses
+    folders = folder_names([material.name for material in folder.materials])
+    for material in folder.materials:
+        words = f" ({material.name})" if material.name else ""
+
+        def tell(text, words=words):
+            say(f"{text}{words}")
+
+        analysis = analyses.get(material.name) or analyse(material.study, material.cohort, seed, tell)
+        validated = _validated(material, folder, tell)
+        results.append(Results(material.name, analysis, validated, material.reference, material.reference_name))
+        material_folder = out / folders[material.name] if len(folder.materials) > 1 else out
+        material_folder.mkdir(exist_ok=True)
+        comparison_content = _compared(analysis, seed, tell) if comparison else None
+        tell("figures and tables")
+        content, section = _write_material(material, analysis, validated, comparison_content, material_folder, seed)
+        contents[material.name] = content
+        sections.append(section)
+    claims = hypotheses(results) if folder.study.report.hypotheses else []
+    content = _content(folder, contents, claims, seed)
+    (out / "result.json").write_text(as_json(content), encoding="utf-8")
+    say("the page")
+    page = _page(folder, content, sections, claims, comparison)
+    (out / "report.html").write_text(page, encoding="utf-8")
+    return content
+
+
+def _page(folder: StudyFolder, content, sections, claims, compares: bool) -> str:
+    """Somebody who is on the map of one material at least is not left out. `compares`: rules, where people suffice."""
+    kept = {name for section in sections for name in section["participants"]}
+    answered = kept.union(*(section["left_out"] for section in sections))
+    return rendered(
+        "study.html",
+        study=folder.study,
+        content=content,
+        warnings=[*content["warnings"], *content["limits"]],
+        notes=folder.notes,
+        sections=sections,
+        people=len(kept),
+        left_out=len(answered) - len(kept),
+        compares=compares,
+        hypotheses=claims,
+    )
+
+
+def _content(folder: StudyFolder, contents, claims, seed) -> dict[str, Any]:
+    return {
+        "materials": contents,
+        "hypotheses": [{"number": h.number, "evidence": [e._asdict() for e in h.evidence]} for h in claims],
+        "study": folder.study.hash,
+        "seed": seed,
+        "versions": versions(),
+        "warnings": named_warnings(contents),
+        "limits": list(folder.limits),
+    }
+
+
+def _validated(material: Material, folder: StudyFolder, say) -> Validated | None:
+    if material.validation is None:
+        return None
+    say("validation sessions")
+    name = material.name if "material" in material.validation and material.name else None
+    return validate(material.validation, folder.sets, material.study.responses, name)
+
+
+def _compared(analysis: Analysis, seed, say) -> dict[str, Any] | None:
+    """Every rule beside the study's; None where people are too few."""
+    if np.sum(analysis.cohort.counts() > 0) < _FEWEST:
+        return None
+    say("comparing the rules of aggregation")
+    return compare(analysis.study, analysis.aggregate, seed, learns=analysis.study.rule in RECIPES)
+
+
+def _write_material(material, analysis: Analysis, validated, compared, folder: Path, seed):
+    """Files of one material; its content for result.json, and its section of the page."""
+    study, people = analysis.study, people_of(analysis.study, analysis.aggregate)
+    truth = material.reference if material.reference_name == "the truth" else None
+    content = result(study, analysis.aggregate, seed, truth, people)
+    data = groups(study, analysis.cohort, analysis.aggregate.posteriors, seed=seed)
+    write_groups(data, folder / "inference.nc")
+    grid = map_dataset(study, analysis.aggregate.surface)
+    grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
+    write_map(grid, folder / "map.nc")
+    tables = _tables(analysis, material, content, people)
+    shares = predictive_shares(data, len(study.responses))
+    figures, hatched = study_figures(analysis, material, shares)
+    pictures = save_figures(figures, folder)
+    if compared is not None:
+        tables["comparison"] = comparison_table(compared)
+        pictures |= save_figures(comparison_figures(compared), folder)
+    if validated is not None:
+        content["validation"] = validation.validation_content(validated)
+        tables |= validation.validation_csv(validated)
+        pictures |= save_figures(validation.validation_figures(validated), folder)
+    tables["dictionary"] = dictionary(tables, study)
+    for name, table in tables.items():
+        table.to_csv(folder / f"{name}.csv", index=False)
+    content |= {
+        "left_out": analysis.left_out,
+        "flags": material.flags.content(),
+        "limits": list(analysis.limits),
+        "optimised": _optimised(analysis),
+        "tolerance": tables["tolerance"].to_dict("records"),
+        "comparison": compared,
+    }
+    section = _section(material, analysis, validated, tables, pictures, content)
+    items = checklist(analysis, content, validated is not None)
+    return content, section | {"hatched": hatched, "checklist": items, "dictionary": tables["dictionary"]}
+
+
+def _tables(analysis: Analysis, material: Material, content, people) -> dict[str, pd.DataFrame]:
+    """The tables that every material has, by the names of their files."""
+    return {
+        "optima": optima_table(content, people),
+        "table_I": table_1(analysis, material.reference),
+        "convergence": convergence_table(analysis),
+        "tolerance": tolerance_table(analysis),
+        "people": analysis.people.assign(left_out=analysis.people["participant"].map(analysis.left_out)),
+        "alternatives": alternatives_table(analysis),
+    }
+
+
+def _optimised(analysis: Analysis) -> dict[str, Any]:
+    """The hyperparameters of maximum evidence, and how far the optimum moves by them."""
+    gp = analysis.maximum.gp
+    return {
+        "theta": np.asarray(gp.kernel.theta).tolist(),
+        "noise": float(gp.likelihood.noise),
+        "thresholds": np.asarray(gp.likelihood.thresholds).tolist(),
+        "nrmse": moved_by_evidence(analysis),
+    }
+
+
+def _section(material: Material, analysis: Analysis, validated, tables, pictures: Pictures, content) -> dict[str, Any]:
+    """What the page says of one material."""
+    from hilbo.report.figures.study import UNKNOWN, typical_person
+
+    readings = {"fixed": analysis.fixed, "optimised": analysis.optimised}
+    return {
+        "name": material.name,
+        "study": analysis.study,
+        "participants": analysis.cohort.names,
+        "answers": int(analysis.cohort.counts().sum()),
+        "limits": analysis.limits,
+        "left_out": analysis.left_out,
+        "flags": flag_sentences(material.flags, analysis.study.exclude_flags),
+        "figures": pictures,
+        "typical": analysis.cohort.names[typical_person(analysis)],
+        "unknown": UNKNOWN,
+        "how": in_place(analysis.aggregate.map),
+        "reference": None if material.reference is None else material.reference_name,
+        "table_1": _with_units(analysis.study, tables["table_I"]),
+        "alternatives": _alternatives(analysis.study, tables["alternatives"]),
+        "tolerance": _tolerances(tables["tolerance"]),
+        "people": _shown(tables["people"].drop(columns=["categories", "left_out"]), digits=_DIGITS),
+        "moved": content["optimised"]["nrmse"],
+        "model_check": content["model_check"],
+        "without": [
+            name for name, reading in readings.items() if all(i is None for i, _ in reading.tolerances.values())
+        ],
+        "comparison": content["comparison"] and comparison_section(analysis.study, content["comparison"]),
+        "halves": analysis.progress.splits,
+        "validation": None if validated is None else validation.validation_section(validated),
+    }
+
+
+def _alternatives(study: Study, table: pd.DataFrame) -> dict[str, Any]:
+    """Head and rows of the table of all optima on the page: no column without a number in it."""
+    forms: dict[str, tuple[str, Any]] = {
+        "mean": ("latent score", "{:.2f}".format),
+        "sd": ("sd", "{:.2f}".format),
+        "p_top": (f'P("{study.responses[-1]}")', percent),
+        "passivity_margin": ("passivity margin (N·s/m)", "{:+.3f}".format),
+    }
+    shown = table.dropna(axis=1, how="all").drop(columns="optimum")
+    parameters = [name for name in shown if name not in forms]
+    names = dict(zip(parameters, heads(study, parameters), strict=True)) | {k: head for k, (head, _) in forms.items()}
+    rows = [
+        [
+            _estimate(label, study.rule),
+            *("" if pd.isna(value) else forms.get(name, ("", number))[1](value) for name, value in row.items()),
+        ]
+        for label, row in zip(table["optimum"], shown.to_dict("records"), strict=True)
+    ]
+    return {"head": ["", *(names[name] for name in shown)], "rows": rows}
+
+
+def _estimate(label: str, rule: str) -> str:
+    """The words of a row of `alternatives_table`."""
+    if label in ROLES:
+        return f"{label} of the sets to compare"
+    name = "aggregate" if label == "population" else label.removeprefix("population, ")
+    return name if " " in name else estimate_words(name, rule)
+
+
+def _with_units(study: Study, table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
+    """A table whose first column names parameters, these with their units."""
+    return _shown(table.assign(parameter=heads(study, table["parameter"])))
+
+
+def _shown(table: pd.DataFrame, digits: int = 4) -> tuple[list[str], list[list[str]]]:
+    """Columns and cells of a table on the page, numbers with so many digits."""
+    return list(map(str, table.columns)), [
+        [_cell(value, digits) for value in row] for row in table.itertuples(index=False)
+    ]
+
+
+def _tolerances(table):
+    """The tolerance intervals as they are read: each end with what it is, and with its interval."""
+    rows = []
+    for row in table.to_dict("records"):
+        resampled = np.isfinite(row["draws_without"])  # not of one person
+        ends = [
+            [
+                f"{_cell(row[end])} ({row[f'{end}_end']})",
+                " to ".join(_cell(row[f"{end}_{side}"], _DIGITS) for side in ("from", "to")) if resampled else "–",
+            ]
+            if np.isfinite(row[end])
+            else ["–", "–"]
+            for end in ("low", "high")
+        ]
+        without = percent(row["draws_without"]) if resampled else "–"
+        rows.append([row["hyperparameters"], row["parameter"], *ends[0], *ends[1], without])
+    return rows
+
+
+def _cell(value, digits=4):
+    if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
+        return "–" if value is None or np.isnan(value) else ("∞" if value > 0 else "−∞")
+    if isinstance(value, float | np.floating):
+        return np.format_float_positional(value, precision=digits, unique=False, fractional=False, trim="-")
+    return str(value)

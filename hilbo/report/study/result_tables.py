@@ -1,0 +1,106 @@
+"""Tables of a study's results: optima, convergence, tolerance intervals, distances from the passive boundary."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from hilbo.report.results import moved
+from hilbo.search.rendering import margin_of, set_of
+from hilbo.study.analysis.analysis import Analysis
+
+__all__ = ["alternatives_table", "convergence_table", "table_1", "tolerance_table"]
+
+
+def table_1(analysis: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
+    """The population optimum and the mean of the individual optima, beside the reference if there is one (paper,
+    table I): `parameter`, `reference`, `aggregate`, `error_percent`, `mean_of_optima`, `sd_of_optima`, ...
+
+    `reference` (d,): the parameter set that is known, in the unit cube.
+    """
+    study, aggregate = analysis.study, analysis.aggregate
+    mean, best = aggregate.mean_of_optima, aggregate.optimum.x
+    individual_sets = pd.DataFrame([set_of(study.space, x) for x in np.asarray(aggregate.individuals.x)])
+    ours, theirs = set_of(study.space, best), set_of(study.space, mean)
+    table = pd.DataFrame(
+        {"parameter": list(ours), "aggregate": list(ours.values()), "mean_of_optima": list(theirs.values())}
+    )
+    spread = individual_sets.std(ddof=1, numeric_only=True)  # NaN of one; levels have none
+    table["sd_of_optima"] = [spread.get(name, np.nan) for name in ours]
+    if reference is not None:
+        table.insert(1, "reference", list(set_of(study.space, reference).values()))
+        for name, x in (("error_percent", best), ("mean_error_percent", mean)):
+            ways = moved(study, x, jnp.asarray(reference))["moved"]
+            table[name] = [abs(ways[parameter]["percent"]) for parameter in ours]
+    return table
+
+
+def convergence_table(analysis: Analysis) -> pd.DataFrame:
+    """After each number of trials: NRMSE of the population's running optimum to its last, and of the individuals'
+    (median, quartiles, of those who gave as many answers), both also to the optimum of a half of the people who are not
+    among them, and answers in the highest category so far (paper, figures 5 and 7b)."""
+    study, counts = analysis.study, analysis.progress.counts
+    population_errors, individual_errors = analysis.progress.to_end()
+    top = np.asarray((analysis.cohort.trials.q == len(study.responses) - 1) & analysis.cohort.trials.mask)
+    so_far = np.cumsum(top, axis=1)[:, counts - 1]
+    table = pd.DataFrame({"trials": counts, "population": population_errors})
+    if analysis.progress.splits:
+        table["halves"] = np.median(analysis.progress.halves, axis=1)
+        table["individuals_to_half"] = np.nanmedian(
+            np.where(np.isnan(individual_errors), np.nan, analysis.progress.individual_to_half), axis=1
+        )
+    for name, values in (("individuals", individual_errors.T), ("top_answers", so_far)):
+        table[[f"{name}_low", f"{name}_median", f"{name}_high"]] = np.nanpercentile(values, [25, 50, 75], axis=0).T
+    return table
+
+
+def tolerance_table(analysis: Analysis) -> pd.DataFrame:
+    """Tolerance intervals under fixed and under optimised hyperparameters, with the bootstrap over people of their
+    ends; empty where the highest answer is not the likeliest at the optimum (paper, section VII)."""
+    rows = []
+    for name, reading in (("fixed", analysis.fixed), ("optimised", analysis.optimised)):
+        for parameter, (interval, ends) in reading.tolerances.items():
+            row: dict[str, Any] = {"hyperparameters": name, "parameter": parameter}
+            if interval is not None:
+                row |= {
+                    "low": interval.low,
+                    "high": interval.high,
+                    "low_end": interval.low_end,
+                    "high_end": interval.high_end,
+                }
+            if ends is not None:
+                row |= {
+                    "low_from": ends.low[0],
+                    "low_to": ends.low[1],
+                    "high_from": ends.high[0],
+                    "high_to": ends.high[1],
+                }
+            rows.append(row | {"draws_without": 1.0 if ends is None else ends.lost})
+    columns = ["hyperparameters", "parameter", "low", "high", "low_end", "high_end"]
+    return pd.DataFrame(rows, columns=[*columns, "low_from", "low_to", "high_from", "high_to", "draws_without"])
+
+
+def alternatives_table(analysis: Analysis) -> pd.DataFrame:
+    """Everything that could be presented as the optimum: parameters, latent score, probability of the highest answer,
+    and with a renderer how far from the passive boundary (N.s/m; negative is not passive)."""
+    study, aggregate = analysis.study, analysis.aggregate
+    claims: dict[str, tuple[Any, Any]] = {"population": (aggregate.optimum.x, aggregate.optimum)}
+    claims |= {f"population, {name}": (other.x, other) for name, other in aggregate.alternatives.items()}
+    claims["population, optimised hyperparameters"] = (
+        analysis.optimised.aggregate.optimum.x,
+        analysis.optimised.aggregate.optimum,
+    )
+    claims["mean of the individual optima"] = (aggregate.mean_of_optima, None)
+    if analysis.sets is not None:
+        claims |= {name: (analysis.sets.x[i], None) for i, name in enumerate(("best", "mid", "worst"))}
+    rows = []
+    for name, (x, optimum) in claims.items():
+        row = {"optimum": name} | set_of(study.space, x)
+        row |= (
+            {}
+            if optimum is None
+            else {"mean": float(optimum.mean), "sd": float(optimum.sd), "p_top": float(optimum.class_probabilities[-1])}
+        )
+        rows.append(row if study.space.mechanics is None else row | {"passivity_margin": margin_of(study.space, x)})
+    return pd.DataFrame(rows)

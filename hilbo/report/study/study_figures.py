@@ -1,0 +1,58 @@
+"""The figures of a study's report by name; their titles and captions are in the page's template."""
+
+from typing import Any
+
+import numpy as np
+
+from hilbo.population.learnt.recipes import RECIPES
+from hilbo.study.analysis.analysis import Analysis
+from hilbo.study.analysis.effects import effects_of
+from hilbo.study.folder import Material
+from hilbo.study.results.map_netcdf import on_grid
+
+__all__ = ["comparison_figures", "study_figures"]
+
+Figures = dict[str, Any]  # name -> figure
+
+
+def study_figures(
+    analysis: Analysis, material: Material, shares: tuple[np.ndarray, np.ndarray]
+) -> tuple[Figures, bool]:
+    """Figures 4, 5, 6a, 7 and 8, people, individual optima and the predictive check; and whether a part of the map is
+    hatched. `shares`: of `arviz_groups.predictive_shares`."""
+    from hilbo.report.figures import maps, people, study
+    from hilbo.report.figures import progress as progress_figures
+    from hilbo.report.figures.effects import effects_figure
+    from hilbo.report.figures.regions import class_regions
+
+    chosen, cohort, aggregate, progress = analysis.study, analysis.cohort, analysis.aggregate, analysis.progress
+    best, prior = np.asarray(aggregate.optimum.x), aggregate.map.map_prior
+    references = {} if material.reference is None else {material.reference_name: material.reference}
+    own = f"learnt by {chosen.rule}" if chosen.rule in RECIPES else "fixed hyperparameters"
+    regions = {own: analysis.fixed, "optimised hyperparameters": analysis.optimised}
+    map_, hatched = study.sets_on_map(chosen, aggregate.surface, analysis.sets, best, cohort, prior)
+    figures = {
+        "progression": study.posterior_progress(chosen, cohort, progress, study.typical_person(analysis)),
+        "convergence": progress_figures.individual_convergence(chosen, cohort, progress),
+        "map": map_,
+        "maps-after": maps.slices_after(chosen, progress),
+        "population-convergence": progress_figures.population_convergence(progress, references),
+        "classes": class_regions(regions),
+        "people": people.people_figure(analysis.people, analysis.left_out),
+        "predictive": people.predictive_check(chosen.responses, *shares),
+    }
+    if not on_grid(chosen.space):
+        effects = effects_of(chosen, aggregate.surface, best, analysis.population.seed)
+        figures["effects"] = effects_figure(chosen, effects, best)
+    if chosen.space.dim > 1:  # a scatter of one parameter is none
+        marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)} | references
+        figures["optima"] = maps.optima_scatter(chosen, np.asarray(aggregate.individuals.x), marks)
+    return figures, hatched
+
+
+def comparison_figures(content: dict[str, Any]) -> Figures:
+    """Every rule with each person left out, and the reliability of two of them; `content`: of
+    `study.rule_comparison`."""
+    from hilbo.report.figures import population
+
+    return {"comparison": population.rules_figure(content), "reliability": population.reliability_figure(content)}

@@ -1,0 +1,191 @@
+"""One participant's session: ask for a rendering, tell the answer; every state is a new immutable record.
+
+    session = Session.start(study, seed=0)
+    point   = session.ask()              # parameter -> value in physical units
+    session = session.tell("close")
+
+The first trials are a Latin hypercube inside the feasible set, the following maximise the acquisition function over a
+low-discrepancy candidate set and are polished (paper, algorithm 1). The next point depends only on the study, the
+answers so far and the seed: fits start cold, from the physical values that a table would hold, so that a replay (of a
+log, of a table, on another day) gives the same points bit for bit.
+"""
+
+import threading
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, SupportsFloat
+
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from hilbo.errors import InputError
+from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import Posterior, Trials, fit
+from hilbo.search.box import Parameter
+from hilbo.session.choose.selection import Design, design
+from hilbo.session.choose.step import Step, padding
+from hilbo.study.config import Study
+
+__all__ = ["Session", "physical_trials"]
+
+_LARGEST_SEED = 2**63 - 1  # of JAX's keys
+
+
+def physical_trials(study: Study, points: np.ndarray, answers: np.ndarray, capacity: int) -> Trials:
+    """Trials from points (n, d) in physical units: the one way from what tables and logs hold to what a fit sees.
+
+    Rows beyond n are put in the middle of the box before the change of coordinates, so that it compiles once.
+    """
+    padded, categories = padding(study, capacity), np.zeros(capacity, np.int32)
+    padded[: len(points)], categories[: len(answers)] = points, answers
+    return Trials(_to_unit(study.space, padded), jnp.asarray(categories), jnp.arange(capacity) < len(points))
+
+
+@program
+def _to_unit(space, physical):
+    return space.to_unit(physical)
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """A participant's answers so far and the rendering to ask next; made by `start`, `tell` and `replay`.
+
+    `points` (n, d) are in physical units, `answers` (n,) categories from 0; `proposal` (d,) is the next point, None
+    when all the study's trials are answered.
+    """
+
+    study: Study
+    plan: Design
+    points: np.ndarray
+    answers: np.ndarray
+    proposal: np.ndarray | None
+    seed: int
+    step: Step = field(repr=False)
+
+    def __repr__(self) -> str:
+        of, asked = self.study.selection.trials, ""
+        if self.proposal is not None:
+            values = zip(self.study.space.parameters, self.proposal.tolist(), strict=True)
+            asked = ", asks " + ", ".join(f"{p.name} {p.words(value)} {p.unit}".rstrip() for p, value in values)
+        return f'Session("{self.study.name}": {len(self.answers)} of {of} answers{asked})'
+
+    @classmethod
+    def start(cls, study: Study, seed: int = 0) -> "Session":
+        """A session without answers. The seed decides the space-filling trials and the candidates.
+
+        Raises `InputError` for a `study` that has not been loaded, and a `seed` that is no whole number from 0.
+        """
+        if not isinstance(study, Study):
+            raise InputError(f"Session: study is a {type(study).__name__}; load it first, by Study.load(path).")
+        if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+            raise InputError(f"Session: seed is {seed!r}; it must be a whole number from 0.")
+        if seed > _LARGEST_SEED:
+            raise InputError(f"Session: seed is {seed}; it must be at most {_LARGEST_SEED}, which is 2^63 - 1.")
+        plan = design(study, seed)
+        step = Step(study, plan)
+        points, answers = _read_only(np.zeros((0, study.space.dim)), np.zeros(0, int))
+        return cls(study, plan, points, answers, step(points, answers), seed, step)
+
+    @classmethod
+    def replay(cls, study: Study, responses: Iterable[str], seed: int = 0) -> "Session":
+        """The session in which these answers were given, in this order."""
+        session = cls.start(study, seed)
+        for response in responses:
+            session = session.tell(response)
+        return session
+
+    @property
+    def trials(self) -> Trials:
+        """The answers as the model's data, with the capacity of the whole session."""
+        return physical_trials(self.study, self.points, self.answers, self.study.selection.trials)
+
+    @property
+    def done(self) -> bool:
+        """Whether all the study's trials are answered."""
+        return self.proposal is None
+
+    def warm(self) -> threading.Thread:
+        """Compile the step that chooses points, in a thread: while the first, given points are answered."""
+        thread = threading.Thread(target=self.step.warm, daemon=True)
+        thread.start()
+        return thread
+
+    def ask(self) -> dict[str, Any]:
+        """The rendering to present next: parameter -> value in physical units, of levels the name of one.
+
+        Raises `InputError` where all trials of the study are answered.
+        """
+        return self._named(_asked(self))
+
+    def tell(self, response: str, at: Mapping[str, Any] | pd.Series | None = None) -> "Session":
+        """The next state, after the participant's answer (one of the study's responses) to the asked point.
+
+        `at`: the point that was really presented, if it was not the asked one: each parameter's value by its name, as
+        `ask` has one, or a row of a DataFrame.
+        Raises `InputError` for a `response` that the study does not have, and a point that is none of its own.
+        """
+        step = self.step
+        if response not in step.responses:
+            raise InputError(
+                f'Session: "{response}" is no answer of this study; give one of {", ".join(step.responses)}.'
+            )
+        shown = _asked(self) if at is None else self._point(at)
+        points = np.concatenate([self.points, shown[None, :]])
+        points, answers = _read_only(points, np.append(self.answers, step.responses.index(response)))
+        return replace(self, points=points, answers=answers, proposal=step(points, answers))
+
+    def _named(self, point: np.ndarray) -> dict[str, Any]:
+        """Physical numbers (d,) by the parameters' names, and levels by their own."""
+        values = zip(self.study.space.parameters, point.tolist(), strict=True)
+        return {p.name: p.shown(value) if p.levels else value for p, value in values}
+
+    def _point(self, at: Mapping[str, Any] | pd.Series) -> np.ndarray:
+        """A rendering (d,) that was presented. Raises `InputError` for one that is none of this study's."""
+        names = ", ".join(self.step.names)
+        if not isinstance(at, Mapping | pd.Series):
+            raise InputError(f"Session: at is a {type(at).__name__}; give a dict with a value for each of {names}.")
+        given = list(at.keys())
+        if len(given) != len(self.step.names) or set(given) != set(self.step.names):
+            raise InputError(f"Session: at has {', '.join(map(str, given))}; give {names}.")
+        for p in self.study.space.parameters:
+            value = at[p.name]
+            if not p.levels and (not isinstance(value, SupportsFloat) or getattr(value, "ndim", 0)):
+                raise InputError(f"Session: {p.name} is {value!r}; give a number.")
+            if not p.holds(_in_its_digits(p, value)):
+                raise InputError(f"Session: {p.name} is {value}; it must be {p.range_words}.")
+        return np.array([_in_its_digits(p, at[p.name]) for p in self.study.space.parameters])
+
+    def posterior(self) -> Posterior:
+        """The participant's posterior after the answers so far."""
+        return fit(self.study.gp, self.trials, inference=self.study.inference)
+
+    def best(self) -> dict[str, Any]:
+        """The rendering with the largest posterior mean, as `ask` has one. Raises `InputError`
+        before the first answer: the prior mean is the same everywhere."""
+        if not len(self.answers):
+            raise InputError("Session: there are no answers yet, and so no best rendering; tell one first.")
+        return self._named(self.step.best(self.posterior()))
+
+
+def _in_its_digits(parameter: Parameter, value: Any) -> float:
+    """A given value as a physical number. The 0.99 of a float32 is 0.99, not 0.9900000095, beyond the range's end."""
+    if parameter.levels:
+        return parameter.number(str(value))
+    dtype = getattr(value, "dtype", np.dtype(float))
+    return float(str(value)) if dtype.kind == "f" and dtype.itemsize < 8 else float(value)
+
+
+def _read_only(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The same arrays, which nobody can change: a state is a record, and its proposal depends on them."""
+    for array in arrays:
+        array.flags.writeable = False
+    return arrays
+
+
+def _asked(session) -> np.ndarray:
+    if session.proposal is None:
+        raise InputError(
+            f"Session: all {len(session.answers)} trials of the study are answered; nothing is left to ask."
+        )
+    return session.proposal

@@ -1,0 +1,83 @@
+"""Ask and tell with a log: a session from a notebook or a script, by the code of the live one.
+
+    with LoggedSession.open("logs", study, header_for(study, "P01", seed=1, warm=False)) as session:
+        while (point := session.ask()) is not None:
+            session.tell(felt(point))
+
+An existing log of the same header is resumed, to exactly the same next rendering.
+"""
+
+import os
+import time
+from pathlib import Path
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.session.choose.look_ahead import LiveChooser
+from hilbo.session.log import actions as live
+from hilbo.session.log.event_log import EventLog, begun, log_name
+from hilbo.session.log.records import Header
+from hilbo.session.log.state import LiveSession
+from hilbo.study.config import Study
+from hilbo.study.file.protocols import protocol
+
+__all__ = ["LoggedSession"]
+
+
+class LoggedSession:
+    """An open session; made by `open`. `dropped` says what was cut off a torn log."""
+
+    def __init__(self, log: EventLog, chooser: LiveChooser) -> None:
+        self.log, self.chooser, self.dropped = log, chooser, log.dropped
+
+    @classmethod
+    def open(cls, folder: str | os.PathLike, study: Study, header: Header) -> "LoggedSession":
+        """Begin a session, or go on with the one of this participant and label. Raises InputError."""
+        path = Path(folder) / log_name(header)
+        if not begun(path):
+            log = EventLog.create(path, study, header)
+            return cls(log, LiveChooser(log.state))
+        log = EventLog.resume(path, study)
+        if log.state.header != msgspec.structs.replace(header, schema=log.state.header.schema):
+            log.close()
+            raise InputError(f"{path}: was begun with another seed, plan or sets; give those, or another label.")
+        return cls(log, LiveChooser(log.state))
+
+    @property
+    def state(self) -> LiveSession:
+        """The session so far."""
+        return self.log.state
+
+    def ask(self) -> dict[str, float] | None:
+        """The rendering to present: parameter -> value in physical units; None at the end. Comparisons have two: see
+        `state.pending.renderings`."""
+        while self.state.screen in ("ready", "rest"):
+            self.log.append(live.go_on(self.state, time.time()))
+        if self.state.need is not None:
+            self.log.append(live.propose(self.state, self.chooser, time.time()))
+        return None if self.state.pending is None else self.state.pending.renderings["a"]
+
+    def tell(self, response: str, **others: str) -> None:
+        """The answer to it; of a comparison `response` is that about a, `others` are class_b and preferred.
+
+        Raises `InputError` if nothing has been asked.
+        """
+        trial = self.state.pending
+        if trial is None:
+            raise InputError("nothing has been asked; call ask() first.")
+        asks = protocol(self.state.study.session, self.state.header.blocks[trial.block].phase).asks
+        values = {asks[0]: response} | others
+        event = live.answer(self.state, trial.id, f"script-{trial.id}", values, time.time(), felt=False)
+        assert event is not None  # the trial is pending
+        self.log.append(event)
+
+    def close(self) -> None:
+        """Let others write the log."""
+        self.log.close()
+
+    def __enter__(self) -> "LoggedSession":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()

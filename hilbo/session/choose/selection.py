@@ -1,0 +1,199 @@
+"""What is asked next: pure functions of the study, what a seed decides, and the answers; traceable.
+
+The first trials are a Latin hypercube inside the feasible set, the following maximise the acquisition function over a
+low-discrepancy candidate set or a lattice and are polished (paper, algorithm 1).
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from hilbo import acquisition
+from hilbo.kernels import gram
+from hilbo.numerics.climbing import Choice, climb, spread
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
+from hilbo.search.apart import differences
+from hilbo.search.candidates import CANDIDATES, search_points
+from hilbo.search.lattice import Lattice, nodes_for, screen, screen_points
+from hilbo.search.space import SearchSpace
+from hilbo.search.space_lattice import lattice_of
+from hilbo.study.config import Inference, Study
+from hilbo.study.file.schema import Selection
+
+__all__ = ["Choosing", "Design", "design", "next_point", "point_after", "point_apart"]
+
+_STARTS = 4  # of the polishing, on the lattice
+_GAIN, _IN_UNITS_OF_F = 1e-7, ("ucb", "mean")  # of the prior's sd: less is no reason to polish on
+_JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in their number
+
+
+class Choosing(eqx.Module):
+    """Of a study, what its choices depend on: studies that differ in anything else are asked the same points, and share
+    their programs. Whoever chooses by it gives the weight of the standard deviation each time."""
+
+    gp: OrdinalGP
+    space: SearchSpace
+    inference: Inference = eqx.field(static=True)
+    selection: Selection = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, study: Study) -> "Choosing":
+        """Without the numbers of the selection that are no part of a program."""
+        selection = msgspec.structs.replace(study.selection, space_filling=0, weight=0.0)
+        return cls(study.gp, study.space, study.inference, selection)
+
+
+class Design(eqx.Module):
+    """What a seed decides in advance: where the first trials are, and among which points the others are searched.
+
+    The latter are a lattice in two or three dimensions, whose nodes are products and cost a hundredth of other points;
+    else, for constraints, whole numbers and levels, and for Thompson's draws, `candidates`.
+    """
+
+    initial: Float[Array, "s d"]
+    candidates: Float[Array, "m d"] | None
+    lattice: Lattice | None
+    key: PRNGKeyArray
+
+
+def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
+    """The seeded part of a session: space-filling points (s, d), and the points to search, in the unit cube."""
+    space, nodes = study.space, nodes_for(float(np.asarray(study.gp.kernel.theta).max()))
+    on_lattice = space.even and space.dim in (2, 3) and study.selection.acquisition != "thompson"
+    return Design(
+        jax.device_put(space.latin_hypercube(study.selection.space_filling, seed)),
+        None if on_lattice else search_points(space, seed, count),
+        lattice_of(space, nodes) if on_lattice else None,
+        jax.random.key(seed),
+    )
+
+
+def next_point(
+    study: Study, plan: Design, trials: Trials, trial: Int[Array, ""] | int, weight: ArrayLike | None = None
+) -> Float[Array, " d"]:
+    """The point (d,) of the unit cube to ask after the given answers, by the study's acquisition; traceable.
+
+    `weight`: of the standard deviation in UCB, if it is not to be the study's.
+    """
+    posterior = fit(study.gp, trials, inference=study.inference, throw=False)
+    return point_after(study, plan, posterior, trial, weight)
+
+
+def point_after(
+    study: Study | Choosing,
+    plan: Design,
+    posterior: Posterior,
+    trial: Int[Array, ""] | int,
+    weight: ArrayLike | None = None,
+) -> Float[Array, " d"]:
+    """The same from the posterior of the answers."""
+    thompson, distance = study.selection.acquisition == "thompson", study.selection.minimum_distance
+    allowed = None
+    if distance:
+        points, usable = _searched(plan, _JOINT_CANDIDATES if thompson else None)
+        allowed = _apart_from(study.gp.kernel.levels, posterior.trials, points, usable, distance)
+    if thompson:
+        return _thompson_point(posterior, plan, trial, allowed)
+    return _highest(study, plan, posterior, _score(study, posterior, weight), allowed).x
+
+
+def point_apart(
+    study: Study, plan: Design, posterior: Posterior, excluded: Float[Array, "k d"], apart: float
+) -> Float[Array, " d"]:
+    """The highest UCB (d,) at least `apart` from the points `excluded`, all in the unit cube; traceable."""
+
+    def allowed(x):
+        return jnp.all(jnp.sum(differences(study.gp.kernel.levels, excluded, x[None, :]) ** 2, axis=1) >= apart**2)
+
+    return _highest(study, plan, posterior, acquisition.UCB(study.selection.weight), allowed).x
+
+
+def _highest(study, plan, posterior, score, allowed=None) -> Choice:
+    """Where a score is largest in the feasible set; screened in float32."""
+
+    def score_at(x):
+        mean, variance = posterior.predict(x[None, :])
+        return score(mean[0], variance[0])
+
+    space = study.space.searched
+    if study.selection.acquisition in _IN_UNITS_OF_F:
+        space["gain"] = _GAIN * jnp.sqrt(study.gp.kernel.variance)
+    short = posterior.astype(jnp.float32)
+    fitted = short.gp.kernel, short.trials.x, short.latent.weights, short.latent.factor
+    if plan.lattice is None:
+        points = plan.candidates
+        if allowed is None:
+            values = screen_points(*fitted, points.astype(jnp.float32), score)
+        else:  # which may rule out all points that were not skipped
+            values = score(*short.predict(points.astype(jnp.float32)))
+        return acquisition.maximise(values, points, score_at, **space, allowed=allowed)
+    screened = screen(*fitted, plan.lattice, score, allowed)
+    rows = spread(screened.hopes, screened.points, _STARTS)
+    usable = screened.hopes[rows] > -jnp.inf
+    return climb(screened.points[rows], usable, score_at, **space, allowed=allowed)
+
+
+def _score(study, posterior, weight):
+    kind = study.selection.acquisition
+    if kind == "ucb":
+        return acquisition.UCB(study.selection.weight if weight is None else weight)
+    if kind == "log_ei":
+        trials = posterior.trials
+        return acquisition.LogEI(jnp.max(jnp.where(trials.mask, posterior.mean(trials.x), -jnp.inf)))
+    if kind == "top_category":
+        return acquisition.TopCategory(study.gp.likelihood.thresholds[-1], study.gp.likelihood.noise)
+    return acquisition.Mean()
+
+
+def _searched(plan: Design, count: int | None) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:
+    """The points (m, d) that are searched, the first `count` of candidates; and which of them are feasible."""
+    if plan.lattice is not None:
+        return plan.lattice.everywhere()
+    assert plan.candidates is not None
+    points = plan.candidates[:count]
+    return points, jnp.ones(len(points), bool)
+
+
+def _apart_from(
+    levels: tuple[int, ...],
+    trials: Trials,
+    points: Float[Array, "m d"],
+    usable: Bool[Array, " m"],
+    distance: float,
+) -> Callable[[Float[Array, " d"]], Bool[Array, ""]]:
+    """Whether a point keeps the distance to every earlier trial; where none of the usable points does, whether it is as
+    far from all trials as one of them can be."""
+
+    def gap(x: Float[Array, " d"]) -> Float[Array, ""]:
+        """Squared distance to the nearest trial."""
+        away = differences(levels, trials.x, x[None, :])
+        return jnp.min(jnp.where(trials.mask, jnp.sum(away**2, axis=1), jnp.inf))
+
+    farthest = jnp.max(jnp.where(usable, jax.vmap(gap)(points), 0.0))
+    rounding = 1.0 - 8.0 * jnp.finfo(trials.x.dtype).eps
+    smallest = jnp.minimum(distance**2, rounding * farthest)
+    return lambda x: gap(x) >= smallest
+
+
+def _thompson_point(
+    posterior: Posterior,
+    plan: Design,
+    trial: Int[Array, ""] | int,
+    allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None,
+) -> Float[Array, " d"]:
+    """Where one joint draw of the function is largest among the candidates that are allowed."""
+    assert plan.candidates is not None
+    points = plan.candidates[:_JOINT_CANDIDATES]
+    cross = gram(posterior.gp.kernel, points, posterior.trials.x)
+    covariance = gram(posterior.gp.kernel, points, points) - cross @ posterior.latent.inverse @ cross.T
+    key = jax.random.fold_in(plan.key, trial)
+    row, draw = acquisition.thompson(key, cross @ posterior.latent.weights, covariance)
+    if allowed is not None:
+        row = jnp.argmax(jnp.where(jax.vmap(allowed)(points), draw, -jnp.inf))
+    return points[row]

@@ -1,0 +1,257 @@
+"""What is compiled once for a session: from answers to their posterior and the next point, one fit for both.
+
+Sessions and live sessions run this very program, so that they ask the same points bit for bit. It takes a posterior
+that is known already in place of answers, and then only searches: the largest posterior mean needs no second fit.
+
+Numbers go in and come out as one vector each, because an array costs more on its way than the numbers in it. The part
+of Laplace's certificate that nobody reads before a choice is explained, 5 % of a step, is made from the fit's numbers
+when the posterior is asked for.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hilbo.gaussian import GaussianPosterior, certify
+from hilbo.kernels import gram
+from hilbo.likelihoods import OrdinalTerms
+from hilbo.numerics.tracing import OfArrays, arrays_in, prepared, program, traced_once
+from hilbo.ordinal_gp import Posterior, Trials, fit
+from hilbo.session.choose.selection import Choosing, Design, point_after
+from hilbo.study.config import Study
+
+__all__ = ["Fitted", "Step", "padding"]
+
+_COUNT, _WEIGHT, _GIVEN, _FACTS = 0, 1, 2, 3  # places in a query, which goes on with categories and points
+_FROM_THE_SEARCH = ("residual", "tolerance", "iterations", "jitter", "condition")  # of a certificate
+_MADE_LATER = ("smallest_variance", "evidence_error", "evidence_rounding", "converged")
+
+
+class Fitted(NamedTuple):
+    """Answers, fitted: the point (d,) that they choose, physical units, and the posterior that chose it."""
+
+    point: Float[np.ndarray, " d"]
+    posterior: Posterior
+
+
+def padding(study: Study, capacity: int) -> Float[np.ndarray, "capacity d"]:
+    """What stands in rows without an answer, in physical units: the middle of the box."""
+    return np.tile([(p.low + p.high) / 2 for p in study.space.parameters], (capacity, 1))
+
+
+class Step:
+    """The compiled step of a study and a design.
+
+    Everything but the answers is bound, so that a call costs no look at the study: JAX gets its arrays as one flat
+    tuple, because walking through the records costs more than the fit where caches are cold.
+    """
+
+    def __init__(self, study: Study, plan: Design) -> None:
+        self._study, self._plan, self._choosing = study, plan, Choosing.of(study)
+        self.weight, self.capacity = float(study.selection.weight), study.selection.trials
+        self._low, self._high = (np.array([getattr(p, end) for p in study.space.parameters]) for end in ("low", "high"))
+        self.initial: Float[np.ndarray, "s d"] = self._physical(_to_physical(study.space, plan.initial))
+        self.responses, self.names = study.responses, study.space.names
+        blank = padding(study, self.capacity).ravel()
+        self._blank = np.concatenate([np.zeros(_FACTS + self.capacity), blank])
+
+    @property
+    def compiled(self) -> Any:
+        """The program behind it; where none are kept, shared by all studies that differ in numbers only."""
+        return self._bound.program
+
+    def __call__(self, points: Float[np.ndarray, "n d"], answers: Any) -> Float[np.ndarray, " d"] | None:
+        """The next point, as numbers that survive a round trip through text; None when all trials are answered."""
+        count = len(answers)
+        if count >= self.capacity:
+            return None
+        if count < len(self.initial):
+            return self.initial[count]
+        return self._physical(self._run(points, answers)[: len(self.names)])
+
+    def fitted(self, points: Float[np.ndarray, "n d"], answers: Any) -> Fitted:
+        """The posterior after any number of answers, and the point that it chooses; by the same call."""
+        numbers = self._run(points, answers)
+        dim = len(self.names)
+        posterior = Posterior(self._study.gp, *jax.device_put(self._layout.tree(numbers[dim:])))
+        point = self._physical(numbers[:dim])
+        return Fitted(point, _certified(posterior) if self._study.inference == "laplace" else posterior)
+
+    def best(self, posterior: Posterior) -> Float[np.ndarray, " d"]:
+        """Where the mean of a posterior of this study is largest, in physical units; nothing is fitted."""
+        query = self._blank.copy()
+        query[_GIVEN] = 1.0
+        packed = jax.device_put(self._layout.vector(posterior))
+        return self._physical(self._bound_to_the_mean(query, packed)[: len(self.names)])
+
+    def _physical(self, points: Any) -> Float[np.ndarray, "*n d"]:
+        """Points (..., d) of a program as float64, which tables and devices have, within the parameters' ranges: where
+        JAX computes with 32 bits, its number for an end may be beyond that end. Nobody may write to them."""
+        numbers = np.asarray(points).astype(np.float64)
+        numbers = np.where(numbers < self._low, self._low, np.where(numbers > self._high, self._high, numbers))
+        numbers.flags.writeable = False
+        return numbers
+
+    def warm(self) -> None:
+        """Compile what chooses."""
+        self._run(np.zeros((0, len(self.names))), ())
+
+    def _run(self, points, answers) -> Float[np.ndarray, " k"]:
+        query, count = self._blank.copy(), len(answers)
+        query[_COUNT], query[_WEIGHT] = count, self.weight
+        query[_FACTS : _FACTS + count] = answers
+        first = _FACTS + self.capacity
+        query[first : first + count * len(self.names)] = np.ravel(points)
+        return np.asarray(self._bound(query, self._none_given))
+
+    @functools.cached_property
+    def _layout(self) -> "_Layout":
+        leaves, structure = jax.tree.flatten(_posterior_shapes(self._choosing))
+        return _Layout(structure, tuple(leaves))
+
+    @functools.cached_property
+    def _none_given(self) -> Float[Array, " p"]:
+        return jax.device_put(np.zeros(self._layout.size))
+
+    @functools.cached_property
+    def _bound(self) -> "_Bound":
+        return self._bound_by(self._choosing)
+
+    @functools.cached_property
+    def _bound_to_the_mean(self) -> "_Bound":
+        """The UCB of weight 0 is largest where the mean is: in most studies this is the program that chooses."""
+        plain = msgspec.structs.replace(self._choosing.selection, acquisition="ucb", minimum_distance=None)
+        return self._bound_by(dataclasses.replace(self._choosing, selection=plain))
+
+    def _bound_by(self, choosing: Choosing) -> "_Bound":
+        arrays = arrays_in((choosing, self._plan))
+        return _Bound(prepared(_step, choosing, self._plan, self._blank, self._none_given), arrays)
+
+
+class _Bound(NamedTuple):
+    """The program of a step, and its arrays but for what is asked."""
+
+    program: OfArrays
+    arrays: tuple[Array, ...]
+
+    def __call__(self, query: Float[np.ndarray, " k"], packed: Float[Array, " p"]) -> Float[Array, " r"]:
+        return self.program((*self.arrays, query, packed))
+
+
+class _Query(NamedTuple):
+    """What a step is asked: how many answers there are, the weight of the sd, and whether a posterior is given."""
+
+    count: Int[Array, ""]
+    weight: Float[Array, ""]
+    given: Bool[Array, ""]
+    categories: Int[Array, " n"]
+    points: Float[Array, "n d"]
+
+    @classmethod
+    def of(cls, numbers: Float[Array, " k"], capacity: int) -> "_Query":
+        first = _FACTS + capacity
+        return cls(
+            numbers[_COUNT].astype(jnp.int32),
+            numbers[_WEIGHT],
+            numbers[_GIVEN] > 0,
+            numbers[_FACTS:first].astype(jnp.int32),
+            numbers[first:].reshape(capacity, -1),
+        )
+
+
+class _Layout(NamedTuple):
+    """How a posterior's trials and latent values lie in a vector."""
+
+    structure: Any
+    leaves: tuple[jax.ShapeDtypeStruct, ...]
+
+    @property
+    def size(self) -> int:
+        return sum(math.prod(leaf.shape) for leaf in self.leaves)
+
+    def vector(self, posterior: Posterior) -> Float[np.ndarray, " p"]:
+        """A posterior's numbers, on the host."""
+        return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves((posterior.trials, posterior.latent))])
+
+    def tree(self, vector: Any) -> Any:
+        """Trials and latent values from a vector (p,) of NumPy or JAX."""
+        ends = np.cumsum([math.prod(leaf.shape) for leaf in self.leaves])
+        parts = [
+            vector[end - math.prod(leaf.shape) : end].reshape(leaf.shape).astype(leaf.dtype)
+            for leaf, end in zip(self.leaves, ends.tolist(), strict=True)
+        ]
+        return jax.tree.unflatten(self.structure, parts)
+
+
+def _step(
+    choosing: Choosing, plan: Design, numbers: Float[Array, " k"], packed: Float[Array, " p"]
+) -> Float[Array, " r"]:
+    """The next point in physical units and, behind it, the posterior's numbers."""
+    query = _Query.of(numbers, choosing.selection.trials)
+    leaves, structure = jax.tree.flatten(_shapes(choosing))
+    layout = _Layout(structure, tuple(leaves))
+    trials, latent = jax.lax.cond(query.given, lambda: layout.tree(packed), lambda: _fitted(choosing, query))
+    point = point_after(choosing, plan, Posterior(choosing.gp, trials, latent), query.count, query.weight)
+    parts = [choosing.space.to_physical(point), *jax.tree.leaves((trials, latent))]
+    return jnp.concatenate([part.astype(numbers.dtype).ravel() for part in parts])
+
+
+@program
+def _posterior_shapes(choosing: Choosing) -> Any:
+    """Of trials and latent values, as a step finds them. A program, though it computes nothing: whoever keeps programs
+    traces no fit to know it."""
+    return _shapes(choosing)
+
+
+def _shapes(choosing: Choosing) -> Any:
+    capacity = choosing.selection.trials
+    numbers = jax.ShapeDtypeStruct((_FACTS + capacity * (1 + choosing.space.dim),), jnp.result_type(float))
+    shapes = jax.eval_shape(lambda given: _fitted(choosing, _Query.of(given, capacity)), numbers)
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), shapes)
+
+
+@traced_once
+def _fitted(choosing: Choosing, query: _Query):
+    """Trials and latent values."""
+    mask = jnp.arange(len(query.categories), dtype=query.count.dtype) < query.count
+    trials = Trials(choosing.space.to_unit(query.points), query.categories, mask)
+    posterior = fit(choosing.gp, trials, inference=choosing.inference, throw=False)
+    latent = posterior.latent
+    return posterior.trials, _uncertified(latent) if choosing.inference == "laplace" else latent
+
+
+def _uncertified(latent: Any) -> GaussianPosterior:
+    """Without what `_certified` makes again, which is then not compiled."""
+    certificate = latent.certificate
+    nothing = {name: jnp.zeros_like(getattr(certificate, name)) for name in _MADE_LATER}
+    return dataclasses.replace(latent, certificate=dataclasses.replace(certificate, **nothing))
+
+
+@program
+def _certified(posterior: Posterior) -> Posterior:
+    """With the certificate that the fit would have given it."""
+    trials, latent, likelihood = posterior.trials, posterior.latent, posterior.gp.likelihood
+    terms = OrdinalTerms(likelihood, trials.q, trials.mask)
+    certificate = certify(
+        gram(posterior.gp.kernel, trials.x, trials.x),
+        latent.mode,
+        latent.weights,
+        terms(latent.mode)[2],
+        latent.factor,
+        lambda eta: terms(eta)[2],
+        latent.log_evidence,
+        **{name: getattr(latent.certificate, name) for name in _FROM_THE_SEARCH},
+    )
+    return dataclasses.replace(posterior, latent=dataclasses.replace(latent, certificate=certificate))
+
+
+@program
+def _to_physical(space, unit):
+    return space.to_physical(unit)

@@ -1,0 +1,106 @@
+"""Beginning a new participant's session from the population's map: which renderings are chosen, and nothing else.
+
+Somebody new is taken for the population g and a deviation h of their own, f = g + h, whose variance is the share 1 - p
+of the prior's, k. What is known of f at a point before their first answer is then
+
+    m0 = mean of the map,    v0 = variance of the map + (1 - p) k,
+
+which takes the prior's place in the committee's rule: with their own posterior m, v under the study's prior k,
+
+    1 / s = 1 / v0 + (1 / v - 1 / k),    mu = s (m0 / v0 + m / v).
+
+The next rendering has the highest mu + weight · sqrt(s) among fixed feasible points; without answers mu = m0, s = v0,
+and where the map knows nothing the rule is the cold one's but for p. Point by point, as the committee itself is: what
+one answer says of h elsewhere is taken from the study's kernel.
+
+Aggregation, reports and the participant's own optimum are made from their answers under the study's prior alone;
+docs/guides/sessions.md has how many trials this saves (benchmarks/warm_start.py).
+"""
+
+import os
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hilbo.ordinal_gp import Posterior
+from hilbo.search.apart import differences
+from hilbo.search.candidates import search_points
+from hilbo.study.config import Study
+from hilbo.study.formats.json_file import digest_of, read_bytes
+
+__all__ = ["SHARE", "WarmStart", "informed", "read_warm_start", "warm_point", "warm_start"]
+
+SHARE = 0.5
+"""p: the part of the prior variance that people are taken to have in common."""
+
+
+class WarmStart(eqx.Module):
+    """Candidates (m, d) of the unit cube, and what the map says there before the first answer: m0 and v0, (m,)."""
+
+    points: Float[Array, "m d"]
+    mean: Float[Array, " m"]
+    variance: Float[Array, " m"]
+    source: str = eqx.field(static=True)
+    """Start of the SHA-256 of the map's file, or another name for it: what the log holds."""
+
+
+def warm_start(
+    study: Study,
+    points: Float[Array, "m d"],
+    mean: Float[Array, " m"],
+    variance: Float[Array, " m"],
+    source: str = "",
+    share: float = SHARE,
+) -> WarmStart:
+    """From the map's mean and variance at candidates of the unit cube. `points` (m, d), `mean` and `variance` (m,)."""
+    prior = float(study.gp.kernel.diagonal(points[0]))
+    return WarmStart(points, mean, variance + (1.0 - share) * prior, source)
+
+
+def informed(study: Study, warm: WarmStart, posterior: Posterior) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """mu and s (m,) at the candidates after a participant's answers; see the module."""
+    mean, explained = posterior.predict_explained(warm.points)
+    prior = study.gp.kernel.diagonal(warm.points[0])
+    gained = explained / (prior * (prior - explained))
+    variance = 1.0 / (1.0 / warm.variance + gained)
+    return variance * (warm.mean / warm.variance + mean / (prior - explained)), variance
+
+
+def warm_point(
+    study: Study,
+    warm: WarmStart,
+    posterior: Posterior,
+    excluded: Float[Array, "k d"] | None = None,
+    apart: float = 0.0,
+) -> Float[Array, " d"]:
+    """The candidate (d,) to ask after a participant's answers, `apart` or farther from the `excluded`; traceable."""
+    mean, variance = informed(study, warm, posterior)
+    score = mean + study.selection.weight * jnp.sqrt(variance)
+    if excluded is not None:
+        away = differences(study.gp.kernel.levels, warm.points[:, None, :], excluded[None, :, :])
+        distance = jnp.sum(away**2, axis=2)
+        score = jnp.where(jnp.all(distance >= apart**2, axis=1), score, -jnp.inf)
+    return warm.points[jnp.argmax(score)]
+
+
+def read_warm_start(path: str | os.PathLike, study: Study, seed: int = 0, share: float = SHARE) -> WarmStart:
+    """From the map.nc of a results folder: at its points, or from its grid, interpolated linearly. Raises InputError if
+    it is of other parameters, or damaged."""
+    from scipy.interpolate import RegularGridInterpolator
+
+    from hilbo.study.results.map_netcdf import on_grid, read_map
+
+    grid = read_map(path, study)
+    source = digest_of(read_bytes(path))
+    mean, variance = np.asarray(grid["mean"]), np.asarray(grid["variance"])
+    if not on_grid(study.space):
+        values = np.stack([grid[name].values for name in study.space.names], axis=-1)
+        points = jnp.asarray(study.space.to_unit(values))
+        return warm_start(study, points, jnp.asarray(mean), jnp.asarray(variance), source=source, share=share)
+    sides = [np.linspace(0.0, 1.0, size) for size in mean.shape]
+    points = search_points(study.space, seed)
+    at = np.asarray(points)
+    values = [jnp.asarray(RegularGridInterpolator(sides, v)(at), points.dtype) for v in (mean, variance)]
+    return warm_start(study, points, *values, source=source, share=share)

@@ -1,0 +1,88 @@
+"""The tables of sessions as a Psych-DS data set: a folder of CSV files, each with a sidecar that says what its columns
+are."""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from hilbo.session.export.columns import column_words
+from hilbo.session.export.tables import presentations_table, sessions_table, sets_table, trials_table, validation_table
+from hilbo.session.log.event_log import log_name
+from hilbo.session.log.state import LiveSession
+from hilbo.study.file.reading import AnyStudy
+from hilbo.study.formats.cell_text import check_text
+from hilbo.study.tables.trials import write_trials
+
+__all__ = ["psych_ds"]
+
+_TABLES = {
+    "trials": trials_table,
+    "validation": validation_table,
+    "sets": sets_table,
+    "presentations": presentations_table,
+    "sessions": sessions_table,
+}
+
+
+def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: AnyStudy) -> list[Path]:
+    """Tables with their sidecars and dataset_description.json; the files. Raises InputError for an id, label or name of
+    a set that a spreadsheet would run."""
+    for state in sessions:
+        _check_names(state)
+    tables = {kind: make(sessions) for kind, make in _TABLES.items()}
+    (folder / "data").mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    columns: dict[str, Any] = {}
+    for kind, table in tables.items():
+        if table.empty:
+            continue
+        words = column_words(study, kind)
+        here = [_variable(str(column), words) for column in table.columns]
+        columns |= {variable["name"]: variable for variable in here if variable["name"] not in columns}
+        written += _write(table, here, folder / "data", kind, study)
+    path = folder / "dataset_description.json"
+    path.write_text(_json(_description(study, len(sessions), list(columns.values()))), encoding="utf-8")
+    return [*written, path]
+
+
+def _write(table: pd.DataFrame, variables: list[dict[str, str]], data: Path, kind: str, study: AnyStudy) -> list[Path]:
+    """A table and its sidecar."""
+    name = re.sub(r"[^A-Za-z0-9]", "", study.name) or "study"
+    path = data / f"study-{name}_table-{kind}_data.csv"
+    write_trials(table, path)
+    sidecar = path.with_suffix(".json")
+    content = {"description": f"{kind} of {study.name}", "variableMeasured": variables}
+    sidecar.write_text(_json(content), encoding="utf-8")
+    return [path, sidecar]
+
+
+def _description(study: AnyStudy, logs: int, variables: list[dict[str, str]]) -> dict[str, Any]:
+    return {
+        "@context": "https://schema.org/",
+        "@type": "Dataset",
+        "name": study.name,
+        "description": f"Live sessions of {logs} logs, study {study.hash}, written by hilbo.",
+        "schemaVersion": "Psych-DS 0.4.0",
+        "variableMeasured": variables,
+    }
+
+
+def _check_names(state: LiveSession) -> None:
+    """Names cannot be left out as words can: without them a table does not say whose its rows are."""
+    header, place = state.header, log_name(state.header)
+    check_text(header.participant, "participant", place)
+    check_text(header.session, "the session's label", place)
+    for name in header.sets:
+        check_text(name, "the name of a set", place)
+
+
+def _variable(column: str, words: Mapping[str, str]) -> dict[str, str]:
+    return {"@type": "PropertyValue", "name": column, "description": words.get(column, column.replace("_", " "))}
+
+
+def _json(content: Any) -> str:
+    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"

@@ -1,0 +1,265 @@
+"""Session logs as tables, made from the logs alone.
+
+`trials_table` is a trial table (every answer to one rendering; voided and undone ones marked so), `validation_table`
+and `sets_table` are those of `hilbo.study.tables.validation` (voided comparisons left out), `presentations_table` has
+every trial that was ever proposed, and what became of it, `sessions_table` the plan that each session was held by.
+`read_log_trials` reads a folder of logs as `hilbo.study.tables.trials.read_trials` reads the exported table, through
+the very same text, so that both give the same bits.
+"""
+
+import os
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from hilbo.errors import InputError
+from hilbo.session.export.columns import UNWRITTEN, presented_column
+from hilbo.session.log.event_log import log_paths, read_session
+from hilbo.session.log.presented import in_words
+from hilbo.session.log.records import Trial
+from hilbo.session.log.state import LiveSession
+from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES, SAMPLES, flag_words
+from hilbo.study.formats.cell_text import runs_in_a_spreadsheet
+from hilbo.study.tables.parameter_sets import role_of, source_of
+from hilbo.study.tables.trials import read_trials, write_trials
+
+__all__ = [
+    "computes_sets",
+    "presentations_table",
+    "read_log_trials",
+    "read_sessions",
+    "sessions_table",
+    "sets_table",
+    "trials_table",
+    "validation_table",
+]
+
+_SINGLE = ("warm-up", "optimisation", "repeat")
+
+
+def read_sessions(
+    folder: str | os.PathLike, study: AnyStudy, note: Callable[[str], Any] = lambda sentence: None
+) -> list[LiveSession]:
+    """Every session in a folder but dry runs; `note` is told of those, and of logs that are cut off.
+
+    Raises InputError if there is none, a log is damaged or of another study, or two are of one session.
+    """
+    paths = log_paths(folder, note)
+    if not paths:
+        raise InputError(f"{folder}: holds no session logs (*.session.jsonl); check the path.")
+    sessions: dict[Path, LiveSession] = {}
+    dry = 0
+    for path in paths:
+        state = read_session(path, study, note)
+        dry += state.header.dry_run
+        if not state.header.dry_run:
+            sessions[path] = state
+    if not sessions:
+        raise InputError(f"{folder}: holds nothing but dry runs, in which nobody took part.")
+    if dry:
+        note(f"{folder}: {'1 dry run is' if dry == 1 else f'{dry} dry runs are'} left out.")
+    _check_once(sessions)
+    return list(sessions.values())
+
+
+def _check_once(sessions: Mapping[Path, LiveSession]) -> None:
+    """Refuse two logs of one session, such as a copy beside its original: their answers would count twice."""
+    first: dict[tuple[str, str], Path] = {}
+    for path, state in sessions.items():
+        header = state.header
+        other = first.setdefault((header.participant, header.session), path)
+        if other != path:
+            raise InputError(
+                f'{path.parent}: "{other.name}" and "{path.name}" are both logs of session {header.session} of'
+                f" participant {header.participant}, whose answers would count twice; keep one of them here."
+            )
+
+
+def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
+    """Every answer to a single rendering, one row each, numbers as they were chosen."""
+    rows = []
+    for state in sessions:
+        for trial in state.trials:
+            if trial.data["phase"] in _SINGLE and trial.values is not None and "b" not in trial.renderings:
+                rows.append(
+                    _place(state, trial)
+                    | {"response": trial.values["class_a"]}
+                    | in_words(state.study, trial.presented["a"])
+                    | {"voided": int(trial.status != "answered"), "status": trial.status}
+                    | {"unblinded": state.header.unblinded or None}
+                    | _times(trial)
+                    | _telemetry(trial)
+                )
+    return _table(rows)
+
+
+def validation_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
+    """Every comparison that counts. Where a program presents, with what it confirmed of either side, which may be off
+    from the sets that were planned."""
+    rows = []
+    for state in sessions:
+        for trial in state.trials:
+            if trial.values is not None and trial.status == "answered" and "b" in trial.renderings:
+                sets, values = trial.sets, trial.values
+                place = _place(state, trial)
+                if trial.data["phase"] == "repeat":
+                    continue
+                rows.append(
+                    {key: place[key] for key in ("participant", "material", "session", "phase", "trial")}
+                    | {"set_a": sets["a"], "set_b": sets["b"], "first": sets[trial.first]}
+                    | {"class_a": values.get("class_a", ""), "class_b": values.get("class_b", "")}
+                    | {"preferred": sets[values["preferred"]]}
+                    | _confirmed(state.study, trial)
+                    | _times(trial)
+                    | _telemetry(trial)
+                )
+    return _table(rows)
+
+
+def _confirmed(study: AnyStudy, trial: Trial) -> dict[str, float | str]:
+    """What was presented on either side, in columns that no parameter's own name can be; {} where a device renders."""
+    if study.stimulus is None:
+        return {}
+    shown = {side: in_words(study, values) for side, values in trial.presented.items()}
+    return {presented_column(side, p.name): shown[side][p.name] for side in shown for p in study.space.parameters}
+
+
+def sets_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
+    """The compared parameter sets, as they were planned. Raises InputError if one name stands for two sets."""
+    rows: dict[str, dict[str, Any]] = {}
+    for state in sessions:
+        for block in state.header.blocks:
+            study = state.study if block.material is None else state.study.material(block.material)
+            rendered = _rendered(study.space.mechanics)
+            for name in dict.fromkeys(n for p in block.trials if p.b is not None for n in (p.a, p.b)):
+                is_what = {"source": source_of(name, block.material), "role": role_of(name), "material": block.material}
+                values = _parameters(study.space, state.header.sets[name])
+                row = {"set_id": name, **is_what, **values, **rendered}
+                if rows.setdefault(name, row) != row:
+                    raise InputError(
+                        f'the set "{name}" of participant {state.header.participant} is not the one that others felt'
+                        " under this name; export the logs of one plan at a time."
+                    )
+    return _table(list(rows.values()))
+
+
+def computes_sets(sessions: Sequence[LiveSession]) -> bool:
+    """Whether `sets_table` has to compute, with JAX: the K0 of sets that were compared."""
+    compared = any(p.b is not None for state in sessions for block in state.header.blocks for p in block.trials)
+    return compared and any(state.study.space.mechanics is not None for state in sessions)
+
+
+def _parameters(box, values: Mapping[str, float]) -> dict[str, Any]:
+    """A set's parameters, with the K0 of one that is rendered."""
+    if box.mechanics is None:
+        return {p.name: p.shown(values[p.name]) if p.levels else float(values[p.name]) for p in box.parameters}
+    from hilbo.search.set_facts import described
+    from hilbo.search.space import SearchSpace
+
+    return described(SearchSpace(box.parameters, box.mechanics), values).parameters
+
+
+def _rendered(mechanics) -> dict[str, Any]:
+    """How all sets of a study are rendered; `states` only where there are any."""
+    if mechanics is None:
+        return {}
+    facts = {"N": mechanics.N, "T": float(mechanics.T), "memory": mechanics.memory}
+    return facts | ({"states": mechanics.states} if mechanics.memory == "full" else {})
+
+
+def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
+    """Every trial that was proposed, and what became of it."""
+    rows = []
+    for state in sessions:
+        for trial in state.trials:
+            rows.append(
+                _place(state, trial)
+                | {"status": trial.status, "presentations": trial.presentation, "proposed_at": trial.proposed}
+                | {f"voided_{key}": _written((trial.voided or {}).get(key, "")) for key in ("by", "reason")}
+                | _times(trial)
+            )
+    return _table(rows)
+
+
+def sessions_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
+    """Every session, with the hash of the plan that it was held by; empty where it was held by none."""
+    rows = []
+    for state in sessions:
+        header = state.header
+        phases = ", ".join(dict.fromkeys(block.phase for block in header.blocks))
+        place = {"participant": header.participant, "session": header.session, "phases": phases}
+        rows.append(place | {"plan": _written(header.plan or ""), "seed": header.seed})
+    return pd.DataFrame(rows)
+
+
+def read_log_trials(
+    folder: str | os.PathLike,
+    study: AnyStudy,
+    material: str | None = None,
+    *,
+    others: bool = True,
+    say: Callable[[int], None] = lambda rows: None,
+    note: Callable[[str], Any] = lambda sentence: None,
+) -> pd.DataFrame:
+    """As `hilbo.study.tables.trials.read_trials`, from a folder of session logs; `study` is the whole one, of all
+    materials."""
+    table = trials_table(read_sessions(folder, study, note))
+    if table.empty:
+        raise InputError(f"{folder}: its sessions hold no answers yet; nothing can be aggregated.")
+    chosen = study.material(material) if material and study.materials else study
+    with tempfile.TemporaryDirectory() as made:
+        path = Path(made) / "trials.csv"
+        write_trials(table, path)
+
+        def note_of_logs(sentence: str) -> None:
+            note(sentence.replace(str(path), str(folder)))
+
+        try:
+            return read_trials(path, chosen, material, others=others, say=say, note=note_of_logs)
+        except InputError as error:
+            raise InputError(str(error).replace(str(path), str(folder))) from None
+
+
+def _written(text: Any) -> Any:
+    return UNWRITTEN if isinstance(text, str) and runs_in_a_spreadsheet(text) else text
+
+
+def _place(state, trial: Trial):
+    data, header = trial.data, state.header
+    return {
+        "participant": header.participant,
+        "session": header.session,
+        "phase": data["phase"],
+        "material": data["material"],
+        "trial": trial.number,
+    }
+
+
+def _times(trial: Trial):
+    answered = trial.answered or {}
+    return {
+        "response_time": answered.get("browser", {}).get("response_s"),
+        "answered_at": answered.get("time"),
+    }
+
+
+def _telemetry(trial: Trial) -> dict[str, Any]:
+    """The flags of a trial that was felt on a device, and the samples that were recorded with it."""
+    counts = trial.telemetry
+    flags = None if counts is None else flag_words(name for name in counts if name != SAMPLES)
+    return {COLUMN: flags, COLUMN_OF_SAMPLES: None if counts is None else counts[SAMPLES]}
+
+
+def _table(rows):
+    """Without columns that say nothing."""
+    table = pd.DataFrame(rows)
+    if COLUMN_OF_SAMPLES in table:
+        table[COLUMN_OF_SAMPLES] = table[COLUMN_OF_SAMPLES].astype("Int64")  # whole numbers, also where some lack
+    for column in ("material", "response_time", "unblinded", COLUMN, COLUMN_OF_SAMPLES):
+        if column in table and table[column].isna().all():
+            table = table.drop(columns=column)
+    return table

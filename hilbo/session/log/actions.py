@@ -1,0 +1,357 @@
+"""A live session: what may be done in a state, each as the event that says so.
+
+    state = LiveSession.start(study, header)
+    event = propose(state, chooser, at)        # or answer, undo, void, ...: what shall be logged, or RefusedError
+    state = state.after(event)                 # once it is on disk
+
+Pure: `at` is the time in s since the epoch. `hilbo.session.log.state` says what an event does.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+from hilbo.errors import InputError
+from hilbo.session.log.header_check import study_of
+from hilbo.session.log.presented import check_confirmed
+from hilbo.session.log.records import Event, Need, RefusedError, Trial
+from hilbo.session.log.state import LiveSession
+from hilbo.study.file.protocols import protocol
+from hilbo.study.file.trial_flags import FLAGS, SAMPLES
+from hilbo.study.formats.cell_text import runs_in_a_spreadsheet
+
+__all__ = [
+    "abort",
+    "answer",
+    "device",
+    "go_on",
+    "missed",
+    "more",
+    "note",
+    "pause",
+    "present",
+    "propose",
+    "repeat",
+    "restorable",
+    "restore",
+    "resume",
+    "sent",
+    "skip",
+    "undo",
+    "void",
+]
+
+
+@runtime_checkable
+class Chooser(Protocol):
+    """What finds renderings: `hilbo.session.choose.look_ahead.LiveChooser`."""
+
+    def choose(self, state: "LiveSession", need: Need) -> dict[str, Any]:
+        """`renderings`, `sets`, `first` and whatever explains them, for a proposal's data."""
+        ...
+
+
+# What may be done: each gives the event that says so, or raises RefusedError.
+
+
+def propose(state: LiveSession, chooser: Chooser, at: float) -> Event:
+    """The next trial: its renderings, and why these. Raises InputError for a rendering that is no finite number."""
+    if state.need is None:
+        raise RefusedError("nothing", f"nothing is to be proposed now: the screen shows {state.screen}.")
+    need = state.need
+    block = state.header.blocks[need.block]
+    phase = "repeat" if need.repeats is not None else block.phase
+    data = {
+        "id": len(state.trials) + 1,
+        "block": need.block,
+        "phase": phase,
+        "material": block.material,
+        "trial": _number(state, phase, block.material),
+        "planned": need.planned,
+        "repeats": need.repeats,
+    }
+    choice = chooser.choose(state, need)
+    for name, value in ((n, v) for values in choice["renderings"].values() for n, v in values.items()):
+        if not math.isfinite(value):
+            raise InputError(f"the next rendering is no number ({name} is {value}); undo or void the last answer.")
+    return _event(state, "propose", at, **data, **choice)
+
+
+def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event:
+    """A rendering is in force, as a device says (`facts`: its CRC, what it read back, times), or as the program that
+    presents it does (`values`: parameter -> physical unit). Raises RefusedError for values that are too far off."""
+    pending = _live(state, trial)
+    if side not in pending.renderings:
+        raise RefusedError("bad-answer", f'trial {trial} has no side "{side}".')
+    if state.study.stimulus is not None:
+        here = study_of(state.study, state.header.blocks[pending.block].material)
+        check_confirmed(here, pending.renderings[side], facts.get("values"), state.header.schema)
+    return _event(state, "sent", at, id=trial, side=side, **facts)
+
+
+def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> Event:
+    """A step of a trial begins (`on`) or ends. None begins in a break, or after the end, nor with a rendering that its
+    program has not confirmed.
+    Raises `RefusedError` for these, and for a step that the trial does not have. `at`: time in s.
+    """
+    pending = _live(state, trial)
+    if on and state.screen != "trial":
+        raise RefusedError("paused", f"no step of trial {trial} begins now: the screen shows {state.screen}.")
+    steps = state.steps_of(pending)
+    if not 0 <= step < len(steps):
+        raise RefusedError("bad-answer", f"trial {trial} has {len(steps)} steps, none with the number {step}.")
+    show = steps[step][0]
+    if on and state.study.stimulus is not None and show in pending.renderings and show not in pending.confirmed:
+        raise RefusedError("unconfirmed", f'nobody has confirmed that side "{show}" of trial {trial} is presented.')
+    return _event(state, "stimulus", at, id=trial, step=step, show=show, on=bool(on))
+
+
+def missed(state: LiveSession, trial: int, show: str, reason: str, at: float) -> Event:
+    """What was to be presented was not: too late, too far off, or the program failed. The trial is void, by rule.
+
+    Raises `RefusedError` where that trial is not the one that is on.
+    """
+    _live(state, trial)
+    return _event(state, "missed", at, id=trial, show=show, reason=reason)
+
+
+def answer(
+    state: LiveSession,
+    trial: Any,
+    client: Any,
+    values: Any,
+    at: float,
+    *,
+    browser: Any = None,
+    telemetry: Mapping[str, int] | None = None,
+    felt: bool = True,
+) -> Event | None:
+    """A participant's answer; None if this very answer (trial, client id and values) has been accepted already.
+
+    `values`: class_a, class_b (responses of the study), preferred ("a" or "b"), as the phase asks. `browser`: its time
+    and the response time, s; numbers by name. `telemetry`: counts of the device's samples while the trial was felt, all
+    of them (`samples`) and those with each flag; None where none were recorded. `felt`: refuse an answer to what was
+    not felt. Raises RefusedError.
+    """
+    if not isinstance(trial, int) or isinstance(trial, bool) or not isinstance(client, str) or not client:
+        raise RefusedError("bad-answer", "an answer needs the number of its trial and the id of its client.")
+    asked = state.trial(trial)
+    if asked.values is not None:
+        if asked.client == client and asked.values == values:
+            return None
+        if asked.client == client:
+            raise RefusedError("answered", f"trial {trial} is answered otherwise already; the first answer counts.")
+        raise RefusedError("answered", f"trial {trial} is answered already, from another page.")
+    if asked.status != "pending":
+        code = "voided" if asked.status == "void" else "old-trial"
+        raise RefusedError(code, f"trial {trial} is over ({asked.status}); the next one will be shown.")
+    if state.aborted is not None:
+        raise RefusedError("over", "the session has ended.")
+    if felt and asked.felt != frozenset(asked.renderings):
+        raise RefusedError("unfelt", f"trial {trial} has not been felt yet.")
+    _check_values(state, asked, values)
+    counts = {} if telemetry is None else {"telemetry": _counts(telemetry)}
+    return _event(state, "answer", at, id=trial, client=client, values=dict(values), browser=_times(browser), **counts)
+
+
+def undo(state: LiveSession, at: float, reason: str = "") -> Event:
+    """Take the last answer back; its rendering is asked again. Raises `RefusedError` if there is none."""
+    _running(state)
+    last = state.last_answered
+    if last is None:
+        raise RefusedError("nothing", "there is no answer to undo.")
+    return _event(state, "undo", at, id=last.id, reason=_text(reason))
+
+
+def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
+    """Feel the pending trial once more from its first step; or an answered one, later, as a check of consistency.
+
+    The answer to a repeated trial of the second kind has the phase "repeat" and is never fitted.
+    Raises `RefusedError` if there is none, or if it is a repetition itself.
+    """
+    _running(state)
+    repeated = state.pending if trial is None else state.trial(trial)
+    if repeated is None or repeated.status not in ("pending", "answered"):
+        raise RefusedError("nothing", "there is no trial to repeat.")
+    if repeated.repeats is not None and repeated.status == "answered":
+        raise RefusedError("nothing", f"trial {repeated.id} is a repetition itself; repeat trial {repeated.repeats}.")
+    return _event(state, "repeat", at, id=repeated.id)
+
+
+def void(state: LiveSession, trial: int, reason: str, at: float) -> Event:
+    """A trial shall not count; its rendering is asked again. This excludes nothing, however often.
+
+    Raises `RefusedError` if it does not count already.
+    """
+    _running(state)
+    voided = state.trial(trial)
+    if voided.status not in ("pending", "answered"):
+        raise RefusedError("nothing", f"trial {trial} is {voided.status} already.")
+    return _event(state, "void", at, id=trial, reason=_text(reason))
+
+
+def restore(state: LiveSession, trial: int, at: float) -> Event:
+    """A voided answer shall count after all. Raises RefusedError if its place has been filled."""
+    _running(state)
+    voided = state.trial(trial)
+    if voided.status != "void" or voided.values is None:
+        raise RefusedError("nothing", f"trial {trial} has no voided answer.")
+    if _filled(state, voided):
+        raise RefusedError("nothing", f"the place of trial {trial} has been filled by another one.")
+    return _event(state, "restore", at, id=trial)
+
+
+def skip(state: LiveSession, reason: str, at: float, trial: int | None = None) -> Event:
+    """The pending planned trial is left out for good: one that the device has stopped twice. Raises RefusedError."""
+    _running(state)
+    skipped = state.skippable
+    if skipped is None or trial not in (None, skipped.id):
+        raise RefusedError("nothing", "only a planned trial that the device has stopped twice can be left out.")
+    return _event(state, "skip", at, id=skipped.id, reason=_text(reason))
+
+
+def _filled(state: LiveSession, trial: Trial) -> bool:
+    """Whether another answer counts in the place of a voided one."""
+    if trial.repeats is not None:
+        pending = state.pending
+        waits = trial.repeats in state.wanted or (pending is not None and pending.repeats == trial.repeats)
+        return bool(trial.voided and trial.voided.get("asked_again")) and not waits
+    others = state.answers(trial.block)
+    if trial.planned is None:
+        beside = trial.voided["beside"] if trial.voided else ()  # a level may have been answered before, for itself
+        same = any(other.id not in beside and other.renderings == trial.renderings for other in others)
+    else:
+        same = any(other.planned == trial.planned for other in others)
+    return same or len(others) >= state.quota(trial.block)
+
+
+def restorable(state: LiveSession, trial: int) -> bool:
+    """Whether `restore` would be accepted."""
+    try:
+        restore(state, trial, 0.0)
+    except RefusedError:
+        return False
+    return True
+
+
+def pause(state: LiveSession, by: str, at: float) -> Event:
+    """A break, asked for by "participant" or "experimenter". Raises `RefusedError` in a break."""
+    _running(state)
+    if state.paused is not None:
+        raise RefusedError("paused", "the session is paused already.")
+    return _event(state, "pause", at, by=by)
+
+
+def resume(state: LiveSession, at: float) -> Event:
+    """The end of a break. Raises `RefusedError` if there is none."""
+    _running(state)
+    if state.paused is None:
+        raise RefusedError("nothing", "the session is not paused.")
+    return _event(state, "resume", at)
+
+
+def abort(state: LiveSession, reason: str, at: float) -> Event:
+    """The end of the session before its time. Raises `RefusedError` when it has ended, and for a reason that a
+    spreadsheet would run."""
+    _running(state)
+    return _event(state, "abort", at, reason=_text(reason))
+
+
+def note(state: LiveSession, text: str, at: float) -> Event:
+    """The experimenter's words. Raises `RefusedError` for words that a spreadsheet would run."""
+    return _event(state, "note", at, text=_text(text))
+
+
+def more(state: LiveSession, at: float) -> Event:
+    """Another rendering of the warm-up, at its end.
+
+    Raises `RefusedError` elsewhere, and when all of its renderings have been felt.
+    """
+    if state.screen != "ready" or state.block is None:
+        raise RefusedError("nothing", "another rendering can be had at the end of the warm-up only.")
+    before = state.block - 1
+    if state.quota(before) >= len(state.header.blocks[before].trials):
+        raise RefusedError("nothing", "all renderings of the warm-up have been felt.")
+    return _event(state, "more", at, block=before)
+
+
+def go_on(state: LiveSession, at: float) -> Event:
+    """From the end of the warm-up, or of a rest, to the next block. Raises `RefusedError` anywhere else."""
+    if state.screen not in ("ready", "rest"):
+        raise RefusedError("nothing", "there is nothing to go on to: no warm-up or rest has come to its end.")
+    return _event(state, "go_on", at, block=state.block)
+
+
+def device(state: LiveSession, condition: str, at: float, *, trial: int | None = None, **facts) -> Event:
+    """The device says "ready", "running", "stopped", "hold", "estop" or "lost"; `facts`: its counters and reason.
+
+    With hold, estop or lost the trial (by default the pending one) is void if it had begun. Raises `RefusedError` for a
+    `trial` that there is not.
+    """
+    if trial is not None:
+        state.trial(trial)
+    return _event(state, "device", at, condition=condition, trial=trial, **facts)
+
+
+def _number(state, phase, material):
+    same = (t for t in state.trials if t.data["phase"] == phase and t.data["material"] == material)
+    return 1 + sum(1 for _ in same)
+
+
+def _event(state, kind, at, **data):
+    if not math.isfinite(at):
+        raise RefusedError("bad-answer", f"the time {at} is no time.")
+    return Event(seq=state.seq + 1, kind=kind, time=float(at), data=data)
+
+
+def _text(text: str) -> str:
+    """Words that will stand in a table as they are. Raises RefusedError for what a spreadsheet would run."""
+    if runs_in_a_spreadsheet(text):
+        raise RefusedError("bad-answer", f'the text "{text[:40]}" begins as a formula does; begin it with a letter.')
+    return text
+
+
+def _running(state):
+    if state.aborted is not None:
+        raise RefusedError("over", "the session has ended.")
+
+
+def _live(state, id):
+    trial = state.trial(id)
+    if trial.status != "pending":
+        raise RefusedError("old-trial", f"trial {id} is {trial.status}.")
+    return trial
+
+
+def _times(browser):
+    if browser is None:
+        return {}
+    good = isinstance(browser, Mapping) and len(browser) <= 8
+    if not good or not all(
+        isinstance(name, str) and isinstance(value, int | float) and math.isfinite(value)
+        for name, value in browser.items()
+    ):
+        raise RefusedError("bad-answer", "the browser's times must be numbers of seconds.")
+    return {name: float(value) for name, value in browser.items()}
+
+
+def _counts(telemetry: Mapping[str, int]) -> dict[str, int]:
+    """Counts of samples. Raises RefusedError for what are none."""
+    names, every = set(telemetry), telemetry.get(SAMPLES, -1)
+    if (
+        SAMPLES not in names
+        or not names <= {SAMPLES, *FLAGS}
+        or not all(0 <= count <= every for count in telemetry.values())
+    ):
+        raise RefusedError("bad-answer", f"the telemetry of a trial has {SAMPLES}, and of these those with a flag.")
+    return dict(telemetry)
+
+
+def _check_values(state, trial, values):
+    asks = protocol(state.study.session, state.header.blocks[trial.block].phase).asks
+    if not isinstance(values, Mapping) or set(values) != set(asks):
+        raise RefusedError("bad-answer", f"an answer to trial {trial.id} has {', '.join(asks)}, and nothing else.")
+    for ask in asks:
+        allowed = ("a", "b") if ask == "preferred" else state.study.responses
+        if not isinstance(values[ask], str) or values[ask] not in allowed:
+            raise RefusedError("bad-answer", f"{ask} must be one of {', '.join(allowed)}.")

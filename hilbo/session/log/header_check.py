@@ -1,0 +1,89 @@
+"""What a session's header has to be, wherever it comes from: a plan, a log, or the command line."""
+
+import math
+
+from hilbo.errors import InputError
+from hilbo.session.log.records import Block, Header
+from hilbo.study.file.protocols import protocol
+from hilbo.study.file.reading import AnyStudy
+from hilbo.study.formats.cell_text import check_id, check_text
+from hilbo.study.formats.json_file import check_values
+
+__all__ = ["SCHEMA", "check_header", "check_label", "check_new_header", "study_of"]
+
+SCHEMA = 3  # of what is begun today
+_SCHEMAS = (1, 2, SCHEMA)
+# Sessions of 1 have other seeds (`hilbo.session.log.header.material_seed`), and up to 2 tolerances of a logarithmic
+# scale were in the parameter's unit (`hilbo.session.log.presented`).
+_MOST = 100_000  # trials of a block
+_LABEL = 64  # characters of a session's label, and of an id
+_DAY = 86_400.0  # s
+
+
+def study_of(study: AnyStudy, material: str | None) -> AnyStudy:
+    """The study of one material; None for a study, or a session, without."""
+    return study if material is None else study.material(material)
+
+
+def check_header(study: AnyStudy, header: Header) -> None:
+    """Refuse a header that no session of this study can have, of whatever version. Raises InputError."""
+    if header.schema not in _SCHEMAS:
+        known = ", ".join(map(str, _SCHEMAS))
+        raise InputError(f"the session's header is of schema {header.schema}; this hilbo knows {known}.")
+    person = header.participant
+    if not 0 < len(person) <= _LABEL or not person.isprintable() or any(mark in person for mark in "/\\"):
+        raise InputError(f"the session's participant is \"{person[:_LABEL]}\", which is nobody's id.")
+    check_label(header.session)
+    if not 0 <= header.seed < 2**63:
+        raise InputError(f"the session's seed is {header.seed}; it must be a whole number from 0.")
+    if not header.blocks:
+        raise InputError("the session's header has no blocks; there is nothing to ask.")
+    for number, block in enumerate(header.blocks, 1):
+        _check_block(study, header, block, f"block {number}")
+    for name, values in header.sets.items():
+        if not all(math.isfinite(value) for value in values.values()):
+            raise InputError(f'the set "{name}" of the session holds what is no finite number.')
+
+
+def check_label(label: str) -> None:
+    """Refuse what no session can be called. Raises InputError."""
+    if not 0 < len(label) <= _LABEL or not label.isprintable():
+        words = "".join(c if c.isprintable() else "?" for c in label[:_LABEL])
+        raise InputError(
+            f'the session\'s label is "{words}"; it must have 1 to {_LABEL} characters, all of which can be printed.'
+        )
+
+
+def check_new_header(study: AnyStudy, header: Header) -> None:
+    """Refuse a header with which no session may begin: one that `check_header` refuses, or with an id or words against
+    the rules for them. Raises InputError."""
+    check_header(study, header)
+    for here in {block.material: study_of(study, block.material) for block in header.blocks}.values():
+        if here.stimulus is not None:
+            here.stimulus.check_shares(here.space.parameters)
+    check_id(header.participant, "the session's header")
+    check_text(header.session, "the session's label")
+    for number, block in enumerate(header.blocks, 1):
+        for name in (name for planned in block.trials for name in (planned.a, planned.b) if name is not None):
+            check_text(name, "the name of a set", f"block {number}")
+
+
+def _check_block(study: AnyStudy, header: Header, block: Block, place: str) -> None:
+    if not 0 <= block.count <= _MOST or not 0 <= block.rest <= _DAY:
+        raise InputError(f"{place} has {block.count} trials after {block.rest:g} s of rest, which is no session's.")
+    here = study_of(study, block.material)
+    if not block.trials:
+        if block.phase != "optimisation":
+            raise InputError(f"{place} is of the phase {block.phase} and has no planned trials.")
+        return
+    if block.count > len(block.trials):
+        raise InputError(f"{place} needs {block.count} trials and plans {len(block.trials)}.")
+    two = "b" in protocol(here.session, block.phase).sides
+    for planned in block.trials:
+        if (planned.b is not None) != two:
+            raise InputError(f"{place} has a trial of {1 + (not two)} renderings, its phase shows {1 + two}.")
+        for name in (planned.a, planned.b):
+            if name is not None and name not in header.sets:
+                raise InputError(f'{place} shows the set "{name}", which the session does not have.')
+            if name is not None:
+                check_values(header.sets[name], here.space.parameters, place, f'the set "{name}"')

@@ -1,0 +1,146 @@
+"""The records of a live session: its header, its events, its trials; and what is refused.
+
+Times are seconds since the epoch, put into events by whoever has a clock.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.study.file.protocols import Phase
+
+__all__ = ["Block", "Event", "Header", "Need", "Planned", "RefusedError", "Status", "Trial"]
+
+Status = Literal["pending", "answered", "undone", "void", "dropped", "left out"]
+
+
+class RefusedError(InputError):
+    """What cannot be done now; `code` says why, for a program: old-trial, voided, answered, unfelt, unconfirmed, off,
+    bad-answer, paused, over, nothing."""
+
+    def __init__(self, code: str, sentence: str) -> None:
+        super().__init__(sentence)
+        self.code = code
+
+
+class Event(msgspec.Struct, frozen=True, kw_only=True):
+    """Something that happened: its number in the log (from 1), its kind, when (s since the epoch), and the rest."""
+
+    seq: int
+    kind: str
+    time: float
+    data: dict[str, Any]
+
+
+class Planned(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A trial whose renderings are known in advance: names of sets in the header, and which side is felt first."""
+
+    a: str
+    b: str | None = None
+    first: Literal["a", "b"] = "a"
+
+
+class Block(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A run of trials of one phase with one material.
+
+    `count` of them are needed; `trials` are the planned ones, more than `count` for a warm-up, whose others wait for
+    "another one"; none for an optimisation, which chooses them. `rest`: seconds of break before the block.
+    """
+
+    phase: Phase
+    count: int
+    trials: tuple[Planned, ...] = ()
+    material: str | None = None
+    rest: float = 0.0
+
+
+class Header(msgspec.Struct, frozen=True, kw_only=True):
+    """All that decides a session in advance: the first line of its log.
+
+    `schema`: of 2 is what is begun today (`header_check.SCHEMA`); sessions of 1 choose with other seeds.
+    `unblinded`: what showed its participant the parameters, "try" for `hilbo try`; "" where nothing did.
+    `shown_to`: the roles that were shown the parameters of what is presented, where no device of ours does.
+    """
+
+    schema: int = 1
+    study: str
+    participant: str
+    session: str
+    seed: int
+    blocks: tuple[Block, ...]
+    sets: dict[str, dict[str, float]] = {}
+    plan: str | None = None
+    warm_start: str | None = None
+    consent: str | None = None
+    protocol_number: str = ""
+    versions: dict[str, str] = {}
+    dry_run: bool = False
+    language: str = "en"
+    unblinded: str = ""
+    shown_to: tuple[str, ...] = ()
+
+
+class Need(msgspec.Struct, frozen=True):
+    """What a proposal has to be found for: a planned trial, a repeated one, or, with neither, the chooser's next."""
+
+    block: int
+    planned: int | None = None
+    repeats: int | None = None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A proposal and what became of it. `number` is the row's trial in tables, counted within phase and material.
+
+    `confirmed`: side -> the values that count of what a program presented, where one does; of this presentation alone.
+    `telemetry`: counts of a device's samples while it was felt, up to the answer (`actions.answer`); None without such
+    a record.
+    """
+
+    id: int
+    block: int
+    number: int
+    data: Mapping[str, Any] = field(repr=False)
+    proposed: float
+    planned: int | None = None
+    repeats: int | None = None
+    status: Status = "pending"
+    presentation: int = 1
+    step: int | None = None
+    felt: frozenset[str] = frozenset()
+    on: str | None = None
+    sent: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    confirmed: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    values: Mapping[str, str] | None = None
+    client: str | None = None
+    answered: Mapping[str, Any] | None = field(default=None, repr=False)
+    telemetry: Mapping[str, int] | None = None
+    voided: Mapping[str, Any] | None = None
+
+    @property
+    def renderings(self) -> dict[str, dict[str, float]]:
+        """Side -> parameters in physical units."""
+        return self.data["renderings"]
+
+    @property
+    def presented(self) -> dict[str, dict[str, float]]:
+        """Side -> parameters in physical units, as they count: the confirmed ones where a program presents them."""
+        return {side: {**values, **self.confirmed.get(side, {})} for side, values in self.renderings.items()}
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether it has begun and not all of it has been felt to its end: then it has to begin again."""
+        return self.step is not None and (self.on in self.renderings or self.felt != frozenset(self.renderings))
+
+    @property
+    def sets(self) -> dict[str, str]:
+        """Side -> name of its set, for planned trials."""
+        return self.data.get("sets", {})
+
+    @property
+    def first(self) -> str:
+        """The side that is felt first."""
+        return self.data.get("first", "a")

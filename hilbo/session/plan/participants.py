@@ -1,0 +1,168 @@
+"""participants.csv: who takes part, by pseudonymous id, apart from all answers.
+
+Columns: participant, consent_time (ISO 8601), protocol_number, optional age and handedness; others are kept. Consent
+and the protocol's number must stand there before the first trial.
+"""
+
+import csv
+import datetime
+import os
+import tempfile
+from collections.abc import Mapping
+from itertools import zip_longest
+from pathlib import Path
+
+from hilbo.errors import InputError
+from hilbo.session.log.file_lock import locked_beside
+from hilbo.study.formats.cell_text import but_for_case, check_id, check_text, csv_rows
+
+__all__ = ["COLUMNS", "add_person", "check_consent", "read_people"]
+
+COLUMNS = ("participant", "consent_time", "protocol_number", "age", "handedness")
+_NEEDED = ("participant", "consent_time", "protocol_number")
+_HANDS = ("", "right", "left", "both")
+People = dict[str, dict[str, str]]
+
+
+def read_people(path: str | os.PathLike) -> People:
+    """participant -> row. Raises InputError with the line of what is wrong."""
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            reader, _ = csv_rows(file, str(path))
+            rows = [(reader.line_num, row) for row in reader if any(row)]
+            columns = rows.pop(0)[1] if rows else []
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: is no table that can be read ({error}); save it as CSV in UTF-8.") from error
+    twice = next((name for name in columns if columns.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f'{path}:1: column "{twice}" stands there twice; give each column a name of its own.')
+    missing = [name for name in _NEEDED if name not in columns]
+    if missing:
+        raise InputError(
+            f'{path}:1: column "{missing[0]}" is missing; a list of participants has {", ".join(_NEEDED)}.'
+        )
+    people: People = {}
+    for line, row in rows:
+        if len(row) > len(columns):
+            raise InputError(f"{path}:{line}: has {len(row)} cells, the header has {len(columns)}; fix that line.")
+        person = {key: value.strip() for key, value in zip_longest(columns, row, fillvalue="")}
+        _check(person, f"{path}:{line}")
+        if not person["participant"]:
+            raise InputError(f"{path}:{line}: participant is empty; give each row a participant.")
+        if person["participant"] in people:
+            raise InputError(f"{path}:{line}: participant {person['participant']} stands there twice; keep one row.")
+        people[person["participant"]] = person
+    return people
+
+
+def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
+    """Add a row, and write the table anew, whole or not at all; with its folder. One hilbo after the other, and where
+    the path is a link, in the place that it leads to. Raises InputError."""
+    person = {key: str(value).strip() for key, value in row.items()}
+    _check_words(person, str(path))
+    _check(person, str(path))
+    _check_past(person, str(path))
+    place = _place(Path(path))
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with locked_beside(place):
+            people = read_people(path) if place.exists() else {}
+            if person["participant"] in people:
+                raise InputError(
+                    f"{path}: participant {person['participant']} stands there already; choose another id."
+                )
+            if alike := but_for_case([*people, person["participant"]]):
+                raise InputError(f"{path}: {alike} differ in capitals only; choose another id.")
+            people[person["participant"]] = person
+            _write(place, people, _delimiter(place))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place.") from error
+    return people
+
+
+def _place(path: Path) -> Path:
+    """Where a list lies. Behind a link it must be there: else a drive that is missing would get a list of its own."""
+    place = Path(os.path.realpath(path))
+    if path.is_symlink() and not place.exists():
+        raise InputError(f"{path}: is a link to {place}, where no list is; connect its drive, or remove the link.")
+    return place
+
+
+def check_consent(people: People, participant: str, protocol_number: str = "") -> dict[str, str]:
+    """The participant's row. Raises InputError without consent, or under another protocol than the study's."""
+    if participant not in people:
+        raise InputError(
+            f'participant "{participant}" is not in the list of participants; add them, with the time of their consent.'
+        )
+    row = people[participant]
+    for column in ("consent_time", "protocol_number"):
+        if not row[column]:
+            raise InputError(f"participant {participant} has no {column}; no trial may begin before it stands there.")
+    _check_past(row, f"participant {participant}")
+    if protocol_number and row["protocol_number"] != protocol_number:
+        raise InputError(
+            f"participant {participant} agreed to protocol {row['protocol_number']}, the study's is {protocol_number};"
+            " ask them again."
+        )
+    return row
+
+
+def _check_words(row, place):
+    """The rules for ids and words, for what comes in; a list that stands may hold what earlier versions took."""
+    check_id(row.get("participant", ""), place)
+    for name, text in row.items():
+        check_text(name, "the name of a column", place)
+        check_text(text, name, place)
+
+
+def _check(row, place):
+    if row.get("consent_time"):
+        try:
+            datetime.datetime.fromisoformat(row["consent_time"])
+        except ValueError:
+            raise InputError(
+                f'{place}: consent_time is "{row["consent_time"]}"; write it as 2026-05-04T10:15.'
+            ) from None
+    if row.get("age") and not (row["age"].isdecimal() and int(row["age"]) < 130):
+        raise InputError(f'{place}: age is "{row["age"]}"; it must be a whole number of years, or empty.')
+    if row.get("handedness", "") not in _HANDS:
+        raise InputError(f'{place}: handedness is "{row["handedness"]}"; it must be right, left, both, or empty.')
+
+
+def _check_past(row, place):
+    """Nobody has agreed tomorrow; a day is left, since a time without its zone may be of another one."""
+    if not row.get("consent_time"):
+        return
+    consent = datetime.datetime.fromisoformat(row["consent_time"])
+    if consent > datetime.datetime.now(consent.tzinfo) + datetime.timedelta(days=1):
+        raise InputError(f"{place}: consent_time is {row['consent_time']}, which is to come; write when they agreed.")
+
+
+def _delimiter(path) -> str:
+    """What stands between the cells of a list that is there already."""
+    if not Path(path).exists():
+        return ","
+    with open(path, newline="", encoding="utf-8-sig") as file:
+        return csv_rows(file, str(path))[1]
+
+
+def _write(path, people, delimiter):
+    columns = list(dict.fromkeys((*COLUMNS, *(key for row in people.values() for key in row))))
+    rows = [[row.get(column, "") for column in columns] for row in people.values()]
+    _replace(path, [columns, *rows], delimiter)
+
+
+def _replace(path, rows, delimiter):
+    handle, made = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
+    try:
+        with open(handle, "w", newline="", encoding="utf-8") as file:
+            csv.writer(file, delimiter=delimiter, lineterminator="\n").writerows(rows)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(made, path.stat().st_mode if path.exists() else 0o600)
+        os.replace(made, path)
+    except BaseException:
+        Path(made).unlink(missing_ok=True)
+        raise

@@ -1,0 +1,235 @@
+"""A study's sessions in advance: who is shown what, in which order, from one seed; to be registered before it begins.
+
+`make_plan` gives the whole study as plain data, `plan_hash` what stands in every log, `planned_header` one session of
+it. Materials come in the orders of a Williams design, pairs balanced as `hilbo.session.plan.counterbalance` says.
+
+A validation compares best, mid and worst: of the population's map (`source` aggregate; for people who were not in it),
+or of each participant's own (individual; for these very people). An aggregate-best validation compares the population's
+optimum with every individual's own. Sets of individuals are called by a code that is made from their values alone, in
+plans, logs and tables: whoever withdraws leaves no id in the answers of others.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.session.log.header import header_for, header_of, participant_seed, seed_of, warm_up
+from hilbo.session.log.header_check import SCHEMA, check_header
+from hilbo.session.log.records import Block, Header, Planned
+from hilbo.session.plan.counterbalance import block_size, comparisons, orders
+from hilbo.session.plan.set_codes import OWN, Sets, coded, set_codes
+from hilbo.study.file.protocols import Phase, protocol
+from hilbo.study.file.reading import AnyStudy
+from hilbo.study.formats.cell_text import but_for_case, check_id, check_text
+from hilbo.study.formats.json_file import converted, decoded, read_bytes
+
+__all__ = [
+    "Source",
+    "check_plan",
+    "make_plan",
+    "plan_hash",
+    "planned_by",
+    "planned_header",
+    "read_plan",
+    "reissue",
+]
+
+Source = Literal["aggregate", "individual"]
+_WHAT = "is no plan; make one with hilbo plan"
+_PAIRS = (("best", "mid"), ("best", "worst"), ("mid", "worst"))
+
+
+class _Row(msgspec.Struct):
+    """Who has which session."""
+
+    participant: str
+    header: Header
+    order: Annotated[int, msgspec.Meta(ge=0)] = 0
+    reissued_from: str | None = None
+
+
+class _Plan(msgspec.Struct):
+    """What is read of a plan."""
+
+    hash: str
+    study: str
+    participants: Annotated[tuple[_Row, ...], msgspec.Meta(min_length=1)]
+    source: Source | None = None
+    replaces: tuple[str, ...] = ()
+
+
+def make_plan(
+    study: AnyStudy,
+    participants: Sequence[str],
+    seed: int = 0,
+    phase: Phase = "optimisation",
+    *,
+    materials: Sequence[str] = (),
+    session: str = "1",
+    sets: Mapping[str, Sets] | None = None,
+    source: Source | None = None,
+) -> dict[str, Any]:
+    """The plan of one kind of session for everybody, as plain data.
+
+    **Arguments:** `materials`: all that each participant has, by default those of the study. `sets`: for validations
+    material ("" for a study without) -> name of a set -> parameters; names are `best`, `mid` and `worst`, or with an
+    individual source `PARTICIPANT best` and so on; for aggregate-best `aggregate` and `individual:PARTICIPANT`. The
+    plan has a code in the place of each PARTICIPANT in these names. Raises InputError.
+    """
+    if len(set(participants)) < len(participants) or not participants:
+        raise InputError("plan: participants must be named, each once.")
+    for person in participants:
+        check_id(person, "plan")
+    if alike := but_for_case(participants):
+        raise InputError(f"plan: {alike} differ in capitals only, and many disks take their logs for one; rename one.")
+    check_text(session, "--session")
+    names: list[str | None] = list(materials or study.materials) or [None]
+    codes = set_codes(sets or {})
+    sequence = orders(len(names), len(participants), seed)
+    people = []
+    for i, person in enumerate(participants):
+        in_order = [names[k] for k in sequence[i]]
+        header = _header(study, person, session, participant_seed(seed, person), phase, in_order, sets, source, codes)
+        check_header(study, header)
+        people.append({"participant": person, "order": i, "header": _for_plan(header)})
+    size = block_size(len(names))
+    plan = {
+        "schema": 1,
+        "study": study.hash,
+        "name": study.name,
+        "seed": seed,
+        "phase": phase,
+        "source": source,
+        "materials": names,
+        "complete_at": "any number of participants" if size == 1 else f"multiples of {size} participants",
+        "complete": len(participants) % size == 0,
+        "participants": people,
+    }
+    return plan | {"hash": plan_hash(plan)}
+
+
+def plan_hash(plan: Mapping[str, Any]) -> str:
+    """First 16 hex digits of the SHA-256 of a plan's content, its own hash left out."""
+    content = {key: value for key, value in plan.items() if key != "hash"}
+    text = json.dumps(content, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def planned_header(plan: Mapping[str, Any], study: AnyStudy, participant: str, **others: Any) -> Header:
+    """The header of a planned session. Raises InputError if plan, study and participant do not belong together."""
+    checked = check_plan(plan, study)
+    rows = {row.participant: row.header for row in checked.participants}
+    if participant not in rows:
+        raise InputError(
+            f'participant "{participant}" is not in the plan, which has {len(rows)}, {min(rows)} to {max(rows)}; add'
+            " them by a new plan, or reissue the row of somebody who dropped out."
+        )
+    return msgspec.structs.replace(rows[participant], schema=SCHEMA, plan=checked.hash, **others)
+
+
+def planned_by(plan: Mapping[str, Any], planned: Header, begun: Header) -> bool:
+    """Whether a session was begun by this plan, or by one that it replaces and with the same row; `planned` is what the
+    row gives today. Its label may be another."""
+    known = begun.plan in (plan["hash"], *plan.get("replaces", ()))
+    return known and _for_plan(begun) == _for_plan(msgspec.structs.replace(planned, session=begun.session))
+
+
+def read_plan(path: str | os.PathLike) -> dict[str, Any]:
+    """A plan's content as plain data, which `check_plan` checks. Raises InputError."""
+    return decoded(read_bytes(path), dict[str, Any], str(path), _WHAT)
+
+
+def check_plan(plan: Mapping[str, Any], study: AnyStudy) -> _Plan:
+    """Refuse a plan that was changed after it was made, belongs to another study, or has sessions that cannot be.
+
+    Raises `InputError`, with what to do.
+    """
+    checked = converted(plan, _Plan, "the plan", _WHAT)
+    if checked.hash != plan_hash(plan):
+        raise InputError("the plan was changed after it was made (its hash does not fit); make a new one.")
+    if checked.study != study.hash:
+        raise InputError(
+            f"the plan belongs to another study ({checked.study}, not {study.hash}); use the study file it was made"
+            " from."
+        )
+    names = [row.participant for row in checked.participants]
+    if len(set(names)) < len(names):
+        raise InputError("the plan names a participant twice; make a new one.")
+    for row in checked.participants:
+        check_header(study, row.header)
+        if row.header.participant != row.participant or row.header.study != checked.study:
+            raise InputError(f"the plan's row of {row.participant} has somebody else's session; make a new one.")
+    return checked
+
+
+def reissue(plan: Mapping[str, Any], dropped: str, new: str) -> dict[str, Any]:
+    """The plan in which somebody new has the row (order, seed, sets) of a participant who dropped out. A row is given
+    away once. `replaces` keeps the hash that logs have. Raises InputError."""
+    check_id(new, "plan")
+    rows = [row["participant"] for row in plan["participants"]]
+    if dropped not in rows or new in rows:
+        raise InputError(f'plan: "{dropped}" must be in the plan and "{new}" must not.')
+    given = {row.get("reissued_from"): row["participant"] for row in plan["participants"]}
+    if dropped in given:
+        raise InputError(f'plan: the row of "{dropped}" has been reissued to {given[dropped]}; reissue that one.')
+    if plan["source"] == "individual":
+        raise InputError(f'plan: the sets of "{dropped}" are their own; nobody else can be validated with them.')
+    row = plan["participants"][rows.index(dropped)]
+    fresh = {
+        "participant": new,
+        "order": row["order"],
+        "reissued_from": dropped,
+        "header": row["header"] | {"participant": new},
+    }
+    replaces = [*plan.get("replaces", []), plan["hash"]]  # which is in the logs that there are
+    changed = {**plan, "participants": [*plan["participants"], fresh], "replaces": replaces}
+    return changed | {"hash": plan_hash(changed)}
+
+
+def _for_plan(header: Header):
+    content = msgspec.to_builtins(header)
+    return {key: content[key] for key in ("study", "participant", "session", "seed", "blocks", "sets", "language")}
+
+
+def _header(study, person, session, seed, phase, materials, sets, source, codes) -> Header:
+    if phase == "optimisation":
+        return header_for(study, person, session, seed, materials=materials)
+    if phase == "warm-up" or sets is None:
+        raise InputError(f"plan: a session of {phase} needs sets to compare; give --from result.json.")
+    first_block, compared = warm_up(study, seed, materials[0])
+    blocks = [first_block]
+    for i, material in enumerate(materials):
+        here = sets.get(material or "", {})
+        trials, used = _compared(study, person, phase, here, source, codes, seed_of(seed, i, 7))
+        prefix = f"{material} " if material else ""
+        named = {name: prefix + coded(name, codes) for name in used}
+        renamed = {named[name]: {k: float(v) for k, v in here[name].items()} for name in used}
+        planned = tuple(Planned(named[a], named[b], first) for a, b, first in trials)
+        rest = protocol(study.session, phase).rest if i else 0.0
+        blocks.append(Block(phase, len(planned), planned, material, rest))
+        compared |= renamed
+    return header_of(study, person, session, seed, blocks, compared)
+
+
+def _compared(study, person, phase, sets, source, codes, seed):
+    """A block's comparisons, and the names of the sets in it."""
+    repeats = protocol(study.session, phase).count
+    if phase == "aggregate-best":
+        others = sorted((name for name in sets if name.startswith(OWN)), key=lambda name: coded(name, codes))
+        if "aggregate" not in sets or not others:
+            raise InputError("plan: aggregate-best needs the population's optimum and individuals' own.")
+        pairs = [("aggregate", name) for name in others]
+    else:
+        prefix = f"{person} " if source == "individual" else ""
+        pairs = [(prefix + a, prefix + b) for a, b in _PAIRS]
+        missing = [name for pair in pairs for name in pair if name not in sets]
+        if missing:
+            raise InputError(
+                f'plan: there is no set "{missing[0]}"; participant {person} has no map of their own here.'
+            )
+    return comparisons(pairs, repeats, seed), list(dict.fromkeys(name for pair in pairs for name in pair))

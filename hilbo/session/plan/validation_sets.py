@@ -1,0 +1,108 @@
+"""The sets of a validation, from the results of an optimisation and the answers that these were made of.
+
+The map is fitted again from the answers, so that best, mid and worst are read from the very map, and must have its
+optimum where result.json has it: results of other answers, or of another study, are refused.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hilbo.errors import InputError
+from hilbo.search.candidates import search_points
+from hilbo.session.plan.plan import Source
+from hilbo.study.analysis.tolerance import best_mid_worst
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+from hilbo.study.estimate.aggregate import aggregate_cohort
+from hilbo.study.estimate.learnt import resolved
+from hilbo.study.formats.json_file import check_values
+from hilbo.study.results.result_json import FoundOptimum, Result
+
+__all__ = ["aggregate_best_sets", "check_participants", "validation_sets"]
+
+_SAME = 1e-6  # of the search ranges
+_NAMES = ("best", "mid", "worst")
+NamedSets = dict[str, dict[str, float]]
+
+
+def check_participants(result: Result, participants: Sequence[str], source: Source) -> None:
+    """Validation of the aggregate needs people who are not in it, of individuals' own maps these very people."""
+    in_map = {person.participant for person in result.participants}
+    for person in participants:
+        if source == "aggregate" and person in in_map:
+            raise InputError(
+                f'plan: participant "{person}" is in the map that is to be validated; invite people who are not.'
+            )
+        if source == "individual" and person not in in_map:
+            raise InputError(
+                f'plan: participant "{person}" has no map of their own in the results; plan for those who do.'
+            )
+
+
+def validation_sets(
+    study: Study, result: Result, cohort: Cohort, source: Source, participants: Sequence[str]
+) -> NamedSets:
+    """Best, mid and worst of the map, or of each participant's own (`PARTICIPANT best`): name -> parameters."""
+    cohort = cohort.of([person.participant for person in result.participants])
+    if result.rule not in (None, study.rule):
+        raise InputError(
+            f'plan: result.json is by the rule "{result.rule}", and the study\'s is "{study.rule}"; aggregate again'
+            " without --rule, or write that rule into the study file."
+        )
+    study = resolved(study, cohort)
+    aggregated = aggregate_cohort(study, cohort, result.seed, alternatives=False)
+    _check_same(study, result, np.asarray(aggregated.optimum.x))
+    points = search_points(study.space, result.seed)
+    if source == "aggregate":
+        return _named(study, best_mid_worst(study, aggregated.surface, points, prior=aggregated.map.map_prior).x, "")
+    sets: NamedSets = {}
+    for person in participants:
+        row = cohort.names.index(person)
+        posterior = jax.tree.map(lambda leaf, row=row: leaf[row], aggregated.posteriors)
+        sets |= _named(study, best_mid_worst(study, _Predict(posterior), points).x, f"{person} ")
+    return sets
+
+
+class _Predict(eqx.Module):
+    posterior: Any
+
+    def __call__(self, x):
+        return self.posterior.predict(x)
+
+
+def aggregate_best_sets(study: Study, result: Result) -> NamedSets:
+    """The population's optimum and every individual's own."""
+
+    def of(optimum: FoundOptimum, what: str) -> dict[str, float]:
+        return check_values(optimum.parameters, study.space.parameters, "plan", what)
+
+    sets = {"aggregate": of(result.optimum, "the optimum")}
+    for person in result.participants:
+        if person.optimum is None:
+            raise InputError("plan: the results hold no individuals' optima; aggregate again without --no-individuals.")
+        sets[f"individual:{person.participant}"] = of(person.optimum, f"the optimum of {person.participant}")
+    return sets
+
+
+def _named(study, unit, prefix) -> NamedSets:
+    physical = np.asarray(study.space.to_physical(jnp.asarray(unit))).tolist()
+    return {
+        prefix + name: dict(zip(study.space.names, row, strict=True))
+        for name, row in zip(_NAMES, physical, strict=True)
+    }
+
+
+def _check_same(study, result, x):
+    stated = check_values(result.optimum.parameters, study.space.parameters, "plan", "the optimum")
+    values = np.array([stated[name] for name in study.space.names])
+    apart = np.max(np.abs(np.asarray(study.space.to_unit(values)) - x))
+    if apart > _SAME:
+        raise InputError(
+            f"plan: the optimum of these answers is {apart:.2g} of the ranges away from that of result.json; give the"
+            " trials that it was made from."
+        )

@@ -1,0 +1,219 @@
+"""Everything that a study's results say of one material, computed once for report, tables and figures.
+
+Exclusion comes first: everybody's answers are measured (`hilbo.population.judged.response_quality`), the study's rule
+is applied, and only then is anything aggregated. Then: the aggregate, the optima after fewer trials, best, mid and
+worst, tolerance intervals under the study's hyperparameters and under those of maximum evidence, with their bootstrap
+over people. What cannot be had from these answers is a sentence in `limits`, not an error.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+import pandas as pd
+
+from hilbo.errors import InputError
+from hilbo.hyperparameters.judged_evidence import Judged, judged_sentences, maximise_judged
+from hilbo.hyperparameters.maximum_evidence import MaximumEvidence
+from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED
+from hilbo.population.maps import RuleMap, learnt_map, point_rule
+from hilbo.search.apart import nrmse
+from hilbo.search.candidates import search_points
+from hilbo.study.analysis.cohort_results import CohortResults, Say, analyse_cohort
+from hilbo.study.analysis.heterogeneity import in_place
+from hilbo.study.analysis.progress import Progress
+from hilbo.study.analysis.tolerance import Sets, Tolerance, best_mid_worst, tolerance
+from hilbo.study.analysis.tolerance_intervals import Ends, tolerance_ends
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort
+from hilbo.study.estimate.learnt import learnt_sentences, resolved, that_learns
+from hilbo.study.estimate.location import location_sentences
+from hilbo.study.estimate.optimum import map_optimum
+from hilbo.study.exclusion import included
+
+__all__ = ["Analysis", "Reading", "analyse", "limits_of", "moved_by_evidence"]
+
+_LEARN = ("theta", "noise", "thresholds")
+
+
+class Reading(NamedTuple):
+    """A population map and what is read from it: tolerance interval and its ends' bootstrap for each parameter."""
+
+    study: Study
+    aggregate: Aggregate
+    tolerances: dict[str, tuple[Tolerance | None, Ends | None]]
+
+
+class Analysis(NamedTuple):
+    """All results of one material."""
+
+    population: CohortResults
+    fixed: Reading
+    optimised: Reading
+    maximum: MaximumEvidence
+    sets: Sets | None
+    people: pd.DataFrame
+    """Everybody's measures, those left out too."""
+    left_out: dict[str, str]
+    """Who was left out by the study's rule, and why."""
+    limits: tuple[str, ...]
+
+    @property
+    def study(self) -> Study:
+        """The study, with its own hyperparameters."""
+        return self.population.study
+
+    @property
+    def cohort(self) -> Cohort:
+        """The participants whose answers were aggregated."""
+        return self.population.cohort
+
+    @property
+    def aggregate(self) -> Aggregate:
+        """The population's results under the study's own hyperparameters."""
+        return self.population.aggregate
+
+    @property
+    def progress(self) -> Progress:
+        """The optima after fewer trials."""
+        return self.population.progress
+
+
+def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda text: None) -> Analysis:
+    """Results of one material from all its participants' answers. Raises `InputError` if the rule leaves nobody."""
+    say("consistency, lapses and drift of everybody")
+    cohort, people, left_out = included(study, everybody)
+    population = _with_learnt(analyse_cohort(study, cohort, seed, say), seed, say)
+    study, aggregate = population.study, population.aggregate
+    say("hyperparameters by maximum evidence")
+    judged, optimised_study, optimised = _optimised(study, cohort, seed)
+    maximum = judged.maximum
+    say("reading the maps")
+    sets, sentences = _best_mid_worst(study, aggregate, seed)
+    best = aggregate.optimum
+    location = location_sentences(study, best.x, best.sd, aggregate.asked_variance)
+    limits = (*location, *learnt_sentences(study), *limits_of(study, cohort), *sentences)
+    limits += (*_aggregated_otherwise(aggregate.map), *judged_sentences(judged))
+    if bool(maximum.runaway) or not bool(maximum.converged):
+        limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
+    return Analysis(
+        population,
+        _reading(study, aggregate, seed),
+        _reading(optimised_study, optimised, seed),
+        maximum,
+        sets,
+        people,
+        left_out,
+        limits,
+    )
+
+
+def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
+    """What these answers cannot say, in sentences."""
+    counts, sentences = cohort.counts(), []
+    if len(cohort.names) == 1:
+        map_ = "is that person's own, shrunk towards the prior" if study.rule == "rbcm" else "is that person's own"
+        sentences.append(
+            f"{cohort.names[0]} is the only participant: the population map {map_}, and nothing is known of how people"
+            " differ."
+        )
+    few = [name for name, count in zip(cohort.names, counts, strict=True) if count < 5]
+    if few:
+        sentences.append(f"Fewer than 5 answers were given by {', '.join(few)}; their maps are nearly the prior.")
+    if counts.min() != counts.max():
+        sentences.append(
+            f"Participants gave between {counts.min()} and {counts.max()} answers; after n trials, those with fewer"
+            " enter with what they have."
+        )
+    mask, q = np.asarray(cohort.trials.mask), np.asarray(cohort.trials.q)
+    one = [
+        f'{name} ("{study.responses[int(q[j][mask[j]][0])]}")'
+        for j, name in enumerate(cohort.names)
+        if len(np.unique(q[j][mask[j]])) == 1
+    ]
+    if one:
+        sentences.append(f"One answer only was ever given by {', '.join(one)}: that is no map of where to go.")
+    planned = study.selection.trials
+    if counts.max() < planned:
+        sentences.append(f"The study plans {planned} trials; nobody has given more than {counts.max()}.")
+    return tuple(sentences)
+
+
+def _with_learnt(population: CohortResults, seed: int, say: Say) -> CohortResults:
+    """With the optimum by the recommended recipe among the alternatives, where the study's rule learns nothing."""
+    study, aggregate = population.study, population.aggregate
+    if study.rule in RECIPES:
+        return population
+    say(f"the same by {RECOMMENDED}")
+    learns = resolved(that_learns(study), aggregate.cohort)
+    assert learns.learnt is not None
+    map_ = learnt_map(learns.learnt, aggregate.cohort.trials)
+    optimum = map_optimum(learns, map_, search_points(study.space, seed))
+    beside = eqx.tree_at(
+        lambda a: (a.alternatives, a.maps),
+        aggregate,
+        (aggregate.alternatives | {RECOMMENDED: optimum}, aggregate.maps | {RECOMMENDED: map_}),
+    )
+    return population._replace(aggregate=beside)
+
+
+def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Judged, Study, Aggregate]:
+    """The hyperparameters of maximum evidence, the study with them, and its aggregate."""
+    judged = maximise_judged(study.gp, cohort.trials, _LEARN, inference=study.inference)
+    maximum = judged.maximum
+    answered = int((cohort.counts() > 0).sum())
+    rule = study.rule if study.rule not in RECIPES else "hierarchical" if answered > 1 else "bcm"
+    optimised_study = dataclasses.replace(study, gp=maximum.gp, rule=rule, learnt=None)
+    return judged, optimised_study, aggregate_cohort(optimised_study, cohort, seed, alternatives=False)
+
+
+def _reading(study: Study, aggregate: Any, seed: int) -> Reading:
+    """Tolerance intervals through the map's optimum, along every parameter that is no choice of levels."""
+    x = aggregate.optimum.x
+    rule, share = point_rule(study.rule, aggregate.map.share)
+    return Reading(
+        study,
+        aggregate,
+        {
+            name: (
+                tolerance(study, aggregate.newcomer, x, name),
+                tolerance_ends(study, aggregate.posteriors, x, name, seed, rule=rule, share=share),
+            )
+            for name in (p.name for p in study.space.parameters if not p.levels)
+        },
+    )
+
+
+def _best_mid_worst(study: Study, aggregate: Aggregate, seed: int) -> tuple[Sets | None, tuple[str, ...]]:
+    """The three sets; where the map has none, the sentence that says why."""
+    try:
+        candidates = search_points(study.space, seed)
+        return best_mid_worst(study, aggregate.surface, candidates, prior=aggregate.map.map_prior), ()
+    except InputError as error:
+        return None, (f"No best, mid and worst sets: {str(error).removeprefix('best_mid_worst: ')}",)
+
+
+def _aggregated_otherwise(map_: RuleMap) -> Iterator[str]:
+    """A sentence where what stands beside the map is aggregated otherwise."""
+    how = in_place(map_)
+    if how:
+        yield (
+            f"The map is aggregated by the rule {map_.rule} from all answers at once; maps of fewer trials, and"
+            f" those of bootstrap resamples for the ends of tolerance intervals, are aggregated {how}, so that their"
+            " last optimum need not be the map's."
+        )
+    if map_.effects is not None:
+        yield (
+            "Everybody's own optimum, maps of fewer trials and the ends of tolerance intervals take no account of the"
+            " random effect."
+        )
+
+
+def moved_by_evidence(analysis: Analysis) -> float:
+    """NRMSE between the optima under fixed and under optimised hyperparameters."""
+    return float(
+        nrmse(analysis.optimised.aggregate.optimum.x, analysis.aggregate.optimum.x, analysis.study.gp.kernel.levels)
+    )

@@ -1,0 +1,67 @@
+"""What the answers of one cohort say: the aggregate, and how it came about over the trials.
+
+What `hilbo aggregate` writes. `hilbo.study.analysis.analysis` adds what a report says besides, and takes longer to
+import.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import NamedTuple
+
+from hilbo.population.learnt.recipes import RECIPES
+from hilbo.study.analysis.progress import Progress, follow
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort, asked_variance
+from hilbo.study.estimate.learnt import resolved
+from hilbo.study.estimate.location import location_sentences, optimum_sentence
+
+__all__ = ["CohortResults", "Say", "analyse_cohort"]
+
+Say = Callable[[str], None]
+
+
+class CohortResults(NamedTuple):
+    """What the answers of one cohort say, and how it came about over the trials: what `hilbo aggregate` writes."""
+
+    study: Study
+    aggregate: Aggregate
+    following: Future[Progress]
+    """What becomes `progress`: computed beside what is read from the aggregate."""
+    seed: int
+
+    @property
+    def cohort(self) -> Cohort:
+        """Whose answers these are."""
+        return self.aggregate.cohort
+
+    @property
+    def progress(self) -> Progress:
+        """The optima after fewer trials; waits for them."""
+        return self.following.result()
+
+
+def analyse_cohort(
+    study: Study,
+    cohort: Cohort,
+    seed: int = 0,
+    say: Say = lambda text: None,
+    tell: Callable[[list[str]], None] = lambda sentences: None,
+) -> CohortResults:
+    """The aggregate of a cohort, and its optima after fewer trials, which a thread goes on to compute; everything is
+    fitted once. `tell` is given the optimum in sentences as soon as it is known."""
+    if study.rule in RECIPES:
+        say("learning the hyperparameters from all answers")
+    study = resolved(study, cohort)
+    say(f"fitting {len(cohort.names)} participants ({study.name})")
+
+    def first(optimum, map_):
+        asked = asked_variance(map_, cohort)
+        tell([optimum_sentence(study, optimum.x), *location_sentences(study, optimum.x, optimum.sd, asked)])
+
+    aggregate = aggregate_cohort(study, cohort, seed, first=first)
+    say("the optima after fewer trials")
+    beside = ThreadPoolExecutor(1, "progress")
+    following = beside.submit(follow, study, aggregate, seed)
+    beside.shutdown(wait=False)
+    return CohortResults(study, aggregate, following, seed)

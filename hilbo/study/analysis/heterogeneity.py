@@ -1,0 +1,73 @@
+"""What result.json says of the rule by which people were aggregated, and a warning where its assumptions fail."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from hilbo.numerics.host import placed
+from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED
+from hilbo.population.maps import RuleMap
+from hilbo.population.pointwise import RULES
+from hilbo.population.shared.hierarchical import Share
+from hilbo.study.config import Study
+from hilbo.study.estimate.optimum import predict_map
+
+__all__ = ["ALIKE", "SURE", "heterogeneity", "in_place", "rule_warnings", "share_content"]
+
+ALIKE = ("bcm", "rbcm", "pooled")  # rules that take people to share one function
+SURE = 3.0  # log Bayes factor, about 20 to 1
+_TOO_SURE = 1.5  # times as large as the map says: a standard deviation worth a sentence
+
+
+def heterogeneity(aggregate: Any) -> dict[str, Any] | None:
+    """How people differ, for result.json; None where it was not asked."""
+    return None if aggregate.share is None else share_content(aggregate.share)
+
+
+def share_content(share: Share) -> dict[str, Any]:
+    """A learnt share as plain numbers."""
+    return {
+        "share": float(share.mean),
+        "most_probable": float(share.best),
+        "interval": np.asarray(share.interval).tolist(),
+        "log_bayes_factor_that_people_differ": float(share.against_one),
+        "converged": bool(share.converged),
+    }
+
+
+def in_place(map_: RuleMap) -> str:
+    """How maps of fewer trials, and of bootstrap resamples, are aggregated where that differs; else nothing."""
+    if map_.rule in RECIPES:
+        return "by the rule hierarchical point by point, with the learnt hyperparameters"
+    if map_.rule not in RULES:
+        return "by bcm"
+    return "" if map_.method == "by points" else f"by the rule {map_.rule} point by point"
+
+
+def rule_warnings(study: Study, aggregate: Any) -> list[str]:
+    """A sentence where the study's rule takes people to be alike and the answers say that they are not."""
+    share = aggregate.share
+    if share is None or study.rule not in ALIKE or float(share.against_one) < SURE:
+        return []
+    low, high = np.asarray(share.interval).tolist()
+    words = (
+        f"People differ: of the prior variance they have about {100 * float(share.mean):.0f} % in common (95 %:"
+        f' {100 * low:.0f} to {100 * high:.0f} %), and the rule "{study.rule}" takes that to be 100 %. Its intervals'
+        " are too narrow"
+    )
+    ratio = _sd_ratio(aggregate)
+    if ratio is not None and ratio >= _TOO_SURE:
+        words += (
+            f": at its optimum its standard deviation is {float(aggregate.optimum.sd):.2f}, that of the rule"
+            f' "hierarchical" {ratio:.1f} times as much'
+        )
+    return [words + f'. The rules "{RECOMMENDED}" and "hierarchical" allow for differences.']
+
+
+def _sd_ratio(aggregate: Any) -> float | None:
+    """The hierarchical map's standard deviation over the map's, at the optimum."""
+    if aggregate.hierarchical is None:
+        return None
+    _, variance = predict_map(aggregate.hierarchical, placed(np.asarray(aggregate.optimum.x)[None, :]))
+    return math.sqrt(float(np.asarray(variance)[0])) / float(aggregate.optimum.sd)

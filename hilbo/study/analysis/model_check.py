@@ -1,0 +1,177 @@
+"""Does the model fit? What a study's rule predicts of people who are left out, beside what they answered.
+
+Everybody who answered is left out once, alone or in a group where people are many or folds dear, and predicted from the
+others' answers and, answer by answer, from their own earlier ones: a session chooses renderings by these, so without
+them a model that fits would seem not to. The hyperparameters stay. Compared are the shares of the answers (of all, of
+everybody, and of the thirds of a session), how often repeated renderings get the same answer, and the density of the
+answers beside that of two predictions from the others' answers alone that know nothing of maps
+(`hilbo.population.judged.baselines`). Errors are clustered by person, and not below what the probabilities imply.
+"""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from hilbo.population.judged.baselines import constant, quadratic
+from hilbo.population.judged.leave_one_out import LeftOut, clustered, leave_one_out, leave_one_out_learnt
+from hilbo.population.learnt.recipes import RECIPES
+from hilbo.study.config import Study
+from hilbo.study.estimate.aggregate import Aggregate
+
+__all__ = ["check_sentences", "model_check"]
+
+_FOLDS, _DEAR_FOLDS = 24, 6  # at most; the latter where each is a fit of all answers
+_ERRORS, _WORTH = 2.0, 0.05  # a difference that is said: so many errors, and of shares so much
+_BASELINES = {"constant": "the same shares everywhere", "quadratic": "a quadratic ordinal probit of all answers"}
+_GROUPS = 12  # of people, in which the baselines leave them out
+
+
+def model_check(study: Study, aggregate: Aggregate) -> dict[str, Any] | None:
+    """For result.json; None for fewer than three people with answers."""
+    cohort = aggregate.cohort
+    answered = np.flatnonzero(cohort.counts() > 0)
+    if len(answered) < 3:
+        return None
+    left = _left_out(study, aggregate, answered)
+    names, trials = cohort.names, cohort.trials
+    mask = np.asarray(trials.mask)
+    order = np.concatenate([np.flatnonzero(mask[p]) * 3 // mask[p].sum() for p in _people(left)])
+    x = np.concatenate([np.asarray(trials.x)[p][mask[p]] for p in _people(left)])
+    places = x
+    if aggregate.map.effects is not None:
+        context = np.concatenate([np.asarray(trials.context)[p][mask[p]] for p in _people(left)])
+        places = np.concatenate([x, context[:, None]], axis=1)
+    chosen = (left.q[:, None] == np.arange(len(study.responses))[None, :]).astype(float)
+    content: dict[str, Any] = {
+        "hyperparameters": "as stated" if study.learnt is None else "learnt from all answers",
+        "shares": _shares(study, left, chosen, np.ones(len(left.q), bool)),
+        "by_third": [_shares(study, left, chosen, order == third) for third in range(3) if (order == third).any()],
+        "by_person": {
+            names[p]: {
+                "given": dict(zip(study.responses, chosen[left.person == p].mean(axis=0).tolist(), strict=True)),
+                "predicted": dict(
+                    zip(study.responses, left.probabilities[left.person == p].mean(axis=0).tolist(), strict=True)
+                ),
+            }
+            for p in _people(left)
+        },
+        "repeats": _repeats(left, places),
+        "not_converged": left.not_converged,
+    }
+    return content | {"negative_log_density": _densities(left, x, len(study.responses))}
+
+
+def check_sentences(content: dict[str, Any] | None) -> list[str]:
+    """What does not fit, in one sentence; none where nothing was found."""
+    if content is None:
+        return []
+    wrong = [
+        f'{_percent(row["given"])} of their answers were "{label}", and {_percent(row["predicted"])} were predicted'
+        for label, row in content["shares"].items()
+        if _differs(row)
+    ]
+    repeats = content["repeats"]
+    if repeats is not None and _differs(repeats):
+        wrong.append(
+            f"repeated renderings got the same answer in {_percent(repeats['given'])} of {repeats['pairs']} pairs, and"
+            f" {_percent(repeats['predicted'])} were predicted"
+        )
+    for name, words in _BASELINES.items():
+        row = content["negative_log_density"][name]
+        if row["difference"] < -_ERRORS * row["error"]:
+            wrong.append(f"{words} would predict better ({-row['difference']:.3f} ± {row['error']:.3f} nats an answer)")
+    if not wrong:
+        return []
+    by = "the study's hyperparameters" if content["hyperparameters"] == "as stated" else "the learnt hyperparameters"
+    return [f"With {by} the model does not fit people who were left out and predicted: {'; '.join(wrong)}."]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
+
+
+def _left_out(study: Study, aggregate: Aggregate, answered: np.ndarray) -> LeftOut:
+    """Alone, or in groups of people from all over the table where they would be too many folds."""
+    trials = aggregate.cohort.trials
+    cheap = study.rule in RECIPES or aggregate.map.method == "by points"
+    folds = min(_FOLDS if cheap else _DEAR_FOLDS, len(answered))
+    groups = [answered[k::folds] for k in range(folds)]
+    if study.learnt is not None:
+        return leave_one_out_learnt(study.learnt, trials, study.stated, again=False, groups=groups)[0]
+    share = aggregate.map.share if study.rule == "hierarchical" else None
+    return leave_one_out(
+        study.gp,
+        trials,
+        study.rule,
+        share=share,
+        posteriors=aggregate.posteriors,
+        inference=study.inference,
+        groups=groups,
+    )[0]
+
+
+def _people(left: LeftOut) -> list[int]:
+    """Rows of the cohort, in the order of the predictions."""
+    return list(dict.fromkeys(left.person.tolist()))
+
+
+def _shares(study: Study, left: LeftOut, chosen: Float[np.ndarray, "n C"], rows: np.ndarray) -> dict[str, Any]:
+    """Of every answer: the share that was given and predicted, and the error of the difference."""
+    return {
+        label: _compared(chosen[rows, c], left.probabilities[rows, c], left.person[rows])
+        for c, label in enumerate(study.responses)
+    }
+
+
+def _compared(
+    given: Float[np.ndarray, " n"], predicted: Float[np.ndarray, " n"], person: np.ndarray
+) -> dict[str, float]:
+    """Means of what happened (0 or 1) and of its probability; the error of their difference is by person, or what the
+    probabilities themselves imply, if that is larger: where few answers are all the same, the former is too small."""
+    _, error = clustered(given - predicted, person)
+    implied = float(np.sqrt(np.sum(predicted * (1.0 - predicted)))) / len(given)
+    return {"given": float(given.mean()), "predicted": float(predicted.mean()), "error": float(np.fmax(error, implied))}
+
+
+def _differs(row: dict[str, Any]) -> bool:
+    gap = abs(row["given"] - row["predicted"])
+    return gap > _WORTH and gap > _ERRORS * row["error"]
+
+
+def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> dict[str, Any] | None:
+    """Answers of one person to a rendering that they had before (with a random effect in one context, a column of x):
+    how often they are what the last one there was, and how often they should be."""
+    same, expected, person = [], [], []
+    for p in _people(left):
+        rows = np.flatnonzero(left.person == p)
+        _, place = np.unique(x[rows], axis=0, return_inverse=True)
+        order = np.argsort(place.ravel(), kind="stable")
+        again = np.flatnonzero(np.diff(place.ravel()[order]) == 0)
+        first, second = rows[order[again]], rows[order[again + 1]]
+        same += (left.q[first] == left.q[second]).tolist()
+        expected += left.probabilities[second, left.q[first]].tolist()
+        person += [p] * len(again)
+    if not same:
+        return None
+    return {"pairs": len(same)} | _compared(np.array(same, float), np.array(expected), np.array(person))
+
+
+def _densities(left: LeftOut, x: Float[np.ndarray, "n d"], categories: int) -> dict[str, Any]:
+    """Mean negative log density of the answers, by the map; by the baselines, and what they cost more than the map."""
+    _, place = np.unique(left.person, return_inverse=True)
+    groups = place % _GROUPS
+    costs = {name: np.empty(len(left.q)) for name in _BASELINES}
+    for group in np.unique(groups):
+        out = groups == group
+        predicted = {
+            "constant": constant(left.q, categories, ~out),
+            "quadratic": quadratic(x, left.q, categories, ~out),
+        }
+        for name, chances in predicted.items():
+            costs[name][out] = -np.log(chances[out, left.q[out]])
+    content: dict[str, Any] = {"map": float(left.cost.mean())}
+    for name, cost in costs.items():
+        difference, error = clustered(cost - left.cost, left.person)
+        content[name] = {"cost": float(cost.mean()), "difference": difference, "error": error}
+    return content

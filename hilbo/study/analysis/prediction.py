@@ -1,0 +1,58 @@
+"""What a study predicts at renderings in physical units: from a DataFrame to a DataFrame.
+
+predicted = predict_table(study, aggregate, pd.DataFrame({"K1": [5.6], "B1": [7.9], "alpha": [0.18]}))
+"""
+
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from hilbo.errors import InputError
+from hilbo.numerics.shown import known
+from hilbo.ordinal_gp import Posterior
+from hilbo.study.config import Study
+from hilbo.study.estimate.aggregate import Aggregate
+from hilbo.study.formats.csv_file import FRAME, cells_of, parameter_values, place
+
+__all__ = ["predict_table"]
+
+
+def predict_table(study: Study, model: Posterior | Aggregate, table: pd.DataFrame) -> pd.DataFrame:
+    """The table with what is predicted in each row: `mean` and `sd` of the latent function, and for every response of
+    the study the probability of that answer, in a column `P(response)`.
+
+    **Arguments:**
+
+    - `model`: one participant's [`Posterior`][]; or a study's [`Aggregate`][]: mean and standard deviation are then
+      the population map's, and the answers those of a new participant.
+    - `table`: a column for each of the study's parameters, in its units; other columns and the index stay.
+
+    Raises `InputError` for a column that is missing, and values that are no numbers of the study's ranges.
+    """
+    x = _points(study, table)
+    if isinstance(model, Posterior):
+        if not known(model.trials.mask) or model.trials.mask.ndim != 1:
+            raise InputError("predict_table: the posterior holds several people; give one of them, or the Aggregate.")
+        mean, variance = model.predict(x)
+        chances = model.class_probabilities(x)
+    elif isinstance(model, Aggregate):
+        mean, variance = model.surface(x)
+        chances = model.class_probabilities(model.likelihood, x)
+    else:
+        raise InputError(f"predict_table: model is a {type(model).__name__}; give a Posterior or an Aggregate.")
+    predicted = {"mean": np.asarray(mean), "sd": np.sqrt(np.asarray(variance))}
+    predicted |= {f"P({label})": column for label, column in zip(study.responses, np.asarray(chances).T, strict=True)}
+    return table.assign(**predicted)
+
+
+def _points(study: Study, table: pd.DataFrame) -> jnp.ndarray:
+    """The rows as points (m, d) of the unit cube."""
+    text = cells_of(table)
+    missing = [name for name in study.space.names if name not in text]
+    if missing:
+        wanted = ", ".join(study.space.names)
+        raise InputError(f'{place(FRAME)}column "{missing[0]}" is missing; a rendering of this study has {wanted}.')
+    columns = []
+    for p in study.space.parameters:
+        columns.append(parameter_values(text, p, FRAME))
+    return jnp.asarray(study.space.to_unit(jnp.asarray(np.stack(columns, axis=1))))

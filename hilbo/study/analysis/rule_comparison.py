@@ -1,0 +1,260 @@
+"""Every aggregation rule on one cohort, as data: how it predicts people who are left out, and what its map says.
+
+For each rule: the predictive density, calibration and reliability, answer by answer (`leave_one_out`); its
+optimum; how the optimum is spread, by joint draws of the map (of bcm, hierarchical and pooled, whose joint posterior is
+known) and by a bootstrap over people (of the rules that aggregate people point by point); what each person moves; how
+it agrees with one model of all answers; and how much of the space the answers cover, the map's standard deviation over
+what it is without answers. And, once, how people differ, with a recommendation in words.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hilbo.errors import InputError
+from hilbo.ordinal_gp import Posterior
+from hilbo.population.joint import joint_map, posterior_map
+from hilbo.population.judged.leave_one_out import (
+    LeftOut,
+    calibration,
+    clustered,
+    influence,
+    leave_one_out,
+    leave_one_out_learnt,
+    reliability,
+)
+from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED
+from hilbo.population.maps import GIVEN_RULES, RuleMap, learnt_map, rule_map, share_of
+from hilbo.population.pointwise import RULES
+from hilbo.population.shared.hierarchical import Share
+from hilbo.search.apart import nrmse
+from hilbo.search.candidates import search_points
+from hilbo.study.analysis.bootstrap import resampled_tops
+from hilbo.study.analysis.heterogeneity import ALIKE, SURE, share_content
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+from hilbo.study.estimate.aggregate import Aggregate
+from hilbo.study.estimate.learnt import resolved, that_learns
+from hilbo.study.estimate.optimum import map_optimum
+
+__all__ = ["KNOWN", "compare", "differences", "recommendation"]
+
+KNOWN = 0.8
+"""Where the map's standard deviation is below so much of what it is without answers, these cover the space."""
+
+_POINTS = 400  # at which joint draws and bootstrap seek the optimum
+_DRAWS = 2000
+
+
+def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool = True) -> dict[str, Any]:
+    """All rules side by side; by the study's hyperparameters, and the share that everybody's answers say, but a recipe
+    (the study's, else the recommended one) by what it learns in each fold, if it `learns`. What a rule cannot do stands
+    there as its reason.
+
+    Raises InputError for fewer than three people with answers: two must be left when one is left out.
+    """
+    answered = np.flatnonzero(aggregate.cohort.counts() > 0)
+    if len(answered) < 3:
+        raise InputError(
+            f"compare: {len(answered)} people gave answers; at least three are needed, since each is left out in turn."
+        )
+    everybody = len(answered) == len(aggregate.cohort.names)
+    cohort = aggregate.cohort if everybody else aggregate.cohort.rows(answered)
+    posteriors = jax.tree.map(lambda leaf: leaf[answered], aggregate.posteriors)
+    share = aggregate.share or share_of(study.gp, cohort.trials, study.inference)
+    fitted = aggregate.maps if everybody else {}
+    maps = {rule: fitted.get(rule) or _map(study, cohort, rule, posteriors, share) for rule in GIVEN_RULES}
+    ground = _ground(study, cohort, posteriors, maps["pooled"], seed)
+    rules: dict[str, Any] = {}
+    left: dict[str, LeftOut] = {}
+    for rule, map_ in maps.items():
+        if isinstance(map_, str):
+            rules[rule] = {"refused": map_}
+            continue
+        left[rule], folds = leave_one_out(
+            study.gp, cohort.trials, rule, share=share.mean, posteriors=posteriors, inference=study.inference
+        )
+        rules[rule] = _entry(study, ground, map_, left[rule], folds)
+        rules[rule]["hyperparameters"] = "given" if study.learnt is None else "learnt from all answers"
+    recipe = study.rule if study.rule in RECIPES else RECOMMENDED
+    if learns:
+        left[recipe], rules[recipe] = _learnt_entry(_that_learns(study, recipe, cohort, everybody), ground)
+    for rule, (difference, error) in differences(left).items():
+        rules[rule] |= {"difference": difference, "difference_error": error}
+    words = recommendation(left, rules, share, len(answered))
+    if learns and cohort.contexts:
+        words += f" Only {recipe} takes account of the random effect of {study.random_effect}."
+    content = {"share": share_content(share), "people": len(answered), "answers": int(cohort.counts().sum())}
+    return content | {"rules": rules, "recommendation": words}
+
+
+class _Ground(NamedTuple):
+    """What all rules are compared on: the people with answers, and the points at which maps are."""
+
+    cohort: Cohort
+    posteriors: Posterior
+    candidates: Float[Array, "m d"]
+    """Where optima are searched."""
+    x: Float[Array, "p d"]
+    """Where maps are compared, drawn and resampled."""
+    pooled: tuple[Float[Array, " p"], Float[Array, " d"]] | None
+    """One model of all answers: its mean at `x`, and its optimum; None where it was refused."""
+    seed: int
+
+
+def _ground(study: Study, cohort: Cohort, posteriors: Posterior, pooled: RuleMap | str, seed: int) -> _Ground:
+    candidates = search_points(study.space, seed)
+    x = candidates[: min(_POINTS, len(candidates))]
+    one = None if isinstance(pooled, str) else (pooled.predict(x)[0], map_optimum(study, pooled, candidates).x)
+    return _Ground(cohort, posteriors, candidates, x, one, seed)
+
+
+def _that_learns(study: Study, recipe: str, cohort: Cohort, everybody: bool) -> Study:
+    """The study with what a recipe learns of these people, which is there already if they are everybody."""
+    learns = study if study.rule == recipe else that_learns(study, recipe)
+    return resolved(learns if everybody else dataclasses.replace(learns, learnt=None), cohort)
+
+
+def _learnt_entry(learns: Study, ground: _Ground) -> tuple[LeftOut, dict[str, Any]]:
+    """A recipe, whose hyperparameters are learnt again without each person; beside it, with those of all answers."""
+    assert learns.learnt is not None
+    trials = ground.cohort.trials
+    left, folds = leave_one_out_learnt(learns.learnt, trials, learns.stated)
+    kept, _ = leave_one_out_learnt(learns.learnt, trials, learns.stated, again=False)
+    entry = _entry(learns, ground, learnt_map(learns.learnt, trials), left, folds)
+    entry["hyperparameters"] = "learnt in each fold"
+    entry["negative_log_density_kept"] = float(kept.cost.mean())
+    return left, entry
+
+
+def _map(study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: Share) -> RuleMap | str:
+    """A rule's map, or the sentence that says why there is none."""
+    try:
+        return rule_map(
+            study.gp, cohort.trials, rule, posteriors=posteriors, share=share.mean, inference=study.inference
+        )
+    except InputError as error:
+        return str(error)
+
+
+def _entry(study: Study, ground: _Ground, map_: RuleMap, left: LeftOut, folds: list[RuleMap]) -> dict[str, Any]:
+    """How a rule predicts people who are `left` out, and what its map says; `folds`: its maps without each person."""
+    best = map_optimum(study, map_, ground.candidates)
+    mean, variance = map_.predict(ground.x)
+    moved = influence(map_, folds, ground.x)
+    agreement = from_pooled = None
+    if ground.pooled is not None:
+        other, other_best = ground.pooled
+        agreement = _agreement(mean, other)
+        from_pooled = float(nrmse(best.x, other_best, study.gp.kernel.levels))
+    return calibration(left, ground.seed) | {
+        "reliability": reliability(left),
+        "method": map_.method,
+        "optimum": _parameters(study, best.x),
+        "optimum_sd": float(best.sd),
+        "covered": float(jnp.mean(jnp.sqrt(variance / map_.map_prior) < KNOWN)),
+        "influence": dict(zip(ground.cohort.names, moved.tolist(), strict=True)),
+        "agreement_with_pooled": agreement,
+        "from_pooled": from_pooled,
+        "optimum_by_draws": _by_draws(study, ground, map_),
+        "optimum_by_bootstrap": _by_bootstrap(study, ground, map_),
+    }
+
+
+def _agreement(mean: Float[Array, " p"], other: Float[Array, " p"]) -> float:
+    """Correlation over the points: the scales of two maps need not be the same."""
+    return float(jnp.corrcoef(mean, other)[0, 1])
+
+
+def _by_draws(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[float]] | None:
+    """Quantiles of where joint draws of the map are largest; None where the map has no joint posterior."""
+    x = ground.x
+    if map_.method == "exact" and map_.shared is not None:
+        joint = posterior_map(map_.shared, x)
+    elif map_.rule == "bcm":
+        joint = joint_map(ground.posteriors, x)
+    else:
+        return None
+    return _quantiles(study, x, np.asarray(joint.optima(jax.random.key(ground.seed), _DRAWS)))
+
+
+def _by_bootstrap(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[float]] | None:
+    """Quantiles of where the map of people drawn with replacement is largest; None for rules that take all at once."""
+    if map_.rule not in RULES:
+        return None
+    share = map_.share if map_.rule == "hierarchical" else None
+    x = ground.x
+    tops = resampled_tops(ground.posteriors, x, map_.rule, share, map_.prior, ground.seed, _DRAWS // 4)
+    return _quantiles(study, x, np.bincount(tops, minlength=x.shape[0]) / len(tops))
+
+
+def _quantiles(study: Study, x: Float[Array, "p d"], weight: Float[np.ndarray, " p"]) -> dict[str, list[float]]:
+    """5, 50 and 95 % of each parameter, in its unit, over weighted points; of levels that of the largest weight."""
+    physical = np.asarray(study.space.to_physical(np.asarray(x)))
+    quantiles = {}
+    for i, p in enumerate(study.space.parameters):
+        if p.levels:
+            quantiles[p.name] = [p.shown(np.bincount(physical[:, i].astype(int), weight).argmax().item())]
+            continue
+        order = np.argsort(physical[:, i])
+        total = np.cumsum(weight[order])
+        places = np.searchsorted(total, np.array([0.05, 0.5, 0.95]) * total[-1])
+        quantiles[p.name] = physical[order[np.minimum(places, len(order) - 1)], i].tolist()
+    return quantiles
+
+
+def _parameters(study: Study, x: Float[Array, " d"]) -> dict[str, Any]:
+    values = np.asarray(study.space.to_physical(np.asarray(x))).tolist()
+    return {p.name: p.shown(v) if p.levels else v for p, v in zip(study.space.parameters, values, strict=True)}
+
+
+def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Share, people: int) -> str:
+    """How people differ and which rule predicts best, in a few sentences; `left`: what each rule predicted of
+    everybody's answers. A rule is recommended only if the others predict worse by more than two errors, and if it does
+    not take people to be alike where these differ.
+
+    Costs are compared answer by answer, with errors by person: people are predicted well or badly by all rules alike,
+    which the error of one rule's mean cost would take for doubt.
+    """
+    scored = {rule: scores for rule, scores in rules.items() if "negative_log_density" in scores}
+    best = min(scored, key=lambda rule: scored[rule]["negative_log_density"])
+    low, high = (float(end) for end in share.interval)
+    differ = float(share.against_one)
+    evidence = (
+        "People differ" if differ > SURE else "Nothing says that people differ" if differ < 0 else "People may differ"
+    )
+    words = (
+        f"{evidence}: they share {float(share.mean):.2f} of the prior variance (95 % from {low:.2f} to {high:.2f}; log"
+        f" Bayes factor against people who are alike {differ:+.1f}). Of people left out, {best} predicts best"
+        f" ({scored[best]['negative_log_density']:.3f} ± {scored[best]['negative_log_density_error']:.3f} nats an"
+        f" answer; {100 * scored[best]['central_95']:.1f} % of the answers lie in its central 95 %)."
+    )
+    tied = [rule for rule, gap in differences(left).items() if rule != best and _near(*gap)]
+    if best in ALIKE and differ > SURE:
+        words += f" No rule is recommended: {best} takes people to be alike, so that its intervals are too narrow."
+    elif tied:
+        words += f" No rule is recommended: {', '.join(tied)} predict{'s' * (len(tied) == 1)} as well, within two"
+        words += " standard errors of the difference."
+    else:
+        words += f" Exploratory, since it is drawn from the answers themselves: use {best}."
+    if people < 8:
+        words += f" With {people} people differences between rules are hardly told from chance."
+    return words
+
+
+def differences(left: Mapping[str, LeftOut]) -> dict[str, tuple[float, float]]:
+    """How much more each rule's mean cost is than the best rule's (nats an answer), with the standard error of that
+    difference, paired by answer and clustered by person; 0 and 0 for the best."""
+    best = min(left, key=lambda rule: left[rule].cost.mean())
+    return {rule: clustered(each.cost - left[best].cost, each.person) for rule, each in left.items()}
+
+
+def _near(difference: float, error: float) -> bool:
+    """Whether a difference is within two of its standard errors."""
+    return not math.isfinite(error) or difference <= 2 * error

@@ -1,0 +1,220 @@
+"""A cohort's posteriors, its population map by the study's rule, and the optima of both, as one record.
+
+    table     = read_trials("trials.csv", study)
+    cohort    = cohort_of(table, study)
+    aggregate = aggregate_cohort(study, cohort)
+
+All participants are fitted in one compiled batch over trials padded to one capacity. The population map is a
+committee machine over their posteriors (`hilbo.bcm`), or what the study's rule says (`hilbo.population.maps`).
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from hilbo.errors import InputError
+from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.host import placed
+from hilbo.numerics.shown import known
+from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
+from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map, share_of
+from hilbo.population.newcomer import class_probabilities
+from hilbo.population.shared.hierarchical import Share
+from hilbo.search.apart import middle_of
+from hilbo.search.candidates import search_points
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Inference, Study
+from hilbo.study.estimate.learnt import resolved
+from hilbo.study.estimate.optimum import Optimum, individual_optima, map_optimum, predict_map
+
+__all__ = ["Aggregate", "First", "aggregate_cohort", "asked_variance", "fit_cohort", "other_inference"]
+
+_LARGEST_POOL = 3000  # answers of the pooled alternative: its fit is cubic in their number
+
+
+First = Callable[[Optimum, RuleMap], None]
+
+
+class Aggregate(eqx.Module):
+    """A study's posteriors, its population optimum by the study's rule, and what stands beside it."""
+
+    cohort: Cohort
+    posteriors: Posterior
+    optimum: Optimum
+    individuals: Optimum
+    alternatives: dict[str, Optimum]
+    """Optimum of the plain average of the latent functions, of one GP on all answers (if not too many), by the
+    hierarchical rule and by bcm where the study's rule is another, and of the population map by another inference:
+    "ep", or "laplace" where the study itself says "ep"."""
+    map: RuleMap
+    """The population map by the study's rule."""
+    maps: dict[str, RuleMap]
+    """The maps by all rules that were asked for, the study's among them, and that by the other inference."""
+    share: Share | None
+    """What the answers say of how people differ; None if it was not asked, or fewer than two people answered."""
+
+    def __repr__(self) -> str:
+        if not known(self.optimum.x):
+            return eqx.tree_pformat(self)
+        return f"Aggregate({self.cohort!r}; {self.map!r}; {self.optimum!r})"
+
+    @property
+    def likelihood(self) -> OrdinalProbit:
+        """The likelihood that the posteriors were fitted by: the study's, or what its rule learnt."""
+        return jax.tree.map(lambda leaf: leaf[0], self.posteriors.gp).likelihood
+
+    @property
+    def hierarchical(self) -> RuleMap | None:
+        """The map by the hierarchical rule, beside which the study's is judged."""
+        return self.maps.get("hierarchical")
+
+    @property
+    def certificates(self) -> dict[str, np.ndarray]:
+        """Everybody's certificate, (M,) for each of its figures."""
+        certificate = self.posteriors.certificate
+        return {name: np.asarray(getattr(certificate, name)) for name in certificate.__dataclass_fields__}
+
+    @property
+    def asked_variance(self) -> Float[Array, ""]:
+        """Largest variance of the map at a point that somebody answered. A scalar."""
+        return asked_variance(self.map, self.cohort)
+
+    def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of the population map at points of the unit cube."""
+        return predict_map(self.map, placed(x))
+
+    def class_probabilities(self, likelihood: OrdinalProbit, x: Float[ArrayLike, "m d"]) -> Float[Array, "m C"]:
+        """Probabilities (m, C) of a new person's answers at points of the unit cube."""
+        return class_probabilities(likelihood, *self.newcomer(x), self.map.widths)
+
+    def newcomer(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of a new person's function at points of the unit cube. By the hierarchical rules it
+        differs from the map, which is the function that people share."""
+        mean, variance = self.surface(x)
+        return mean, variance + self.map.apart
+
+    @property
+    def mean_of_optima(self) -> Float[Array, " d"]:
+        """Plain average of the individuals' optima in the unit cube, of levels the commonest: what the paper compares
+        the map with. (d,)."""
+        return placed(middle_of(self.posteriors.gp.kernel.levels, np.asarray(self.individuals.x)))
+
+
+def fit_cohort(
+    study: Study, cohort: Cohort, gps: OrdinalGP | None = None, inference: Inference | None = None
+) -> Posterior:
+    """Everybody's posterior, stacked; with the study's model, or with `gps`, one stacked model each; by the study's
+    inference, or by another."""
+    inference = study.inference if inference is None else inference
+    return _fit_cohort(study.gp, cohort.trials, inference) if gps is None else _fit_own(gps, cohort.trials, inference)
+
+
+# Programs take what they use: two studies that differ in their words share them.
+@program
+def _fit_cohort(gp: OrdinalGP, trials: Trials, inference: Inference) -> Posterior:
+    return jax.vmap(lambda t: fit(gp, t, inference=inference, throw=False))(trials)
+
+
+@program
+def _fit_own(gps: OrdinalGP, trials: Trials, inference: Inference) -> Posterior:
+    return jax.vmap(lambda gp, t: fit(gp, t, inference=inference, throw=False))(gps, trials)
+
+
+def other_inference(study: Study) -> Inference:
+    """The inference beside which a study's results are shown."""
+    return "laplace" if study.inference == "ep" else "ep"
+
+
+def aggregate_cohort(
+    study: Study, cohort: Cohort, seed: int = 0, alternatives: bool = True, first: First = lambda optimum, map_: None
+) -> Aggregate:
+    """Fit everybody, aggregate, and find the optima; the study's `rule` decides the population optimum.
+
+    `seed` decides the candidates that the optima are searched from. Failed certificates are left to the caller, who
+    finds them in `posteriors.certificate`. A rule that learns the hyperparameters does so first, if they are not
+    there. `first` is told the optimum and its map as soon as they are known. Raises `InputError` for a table in place
+    of a cohort.
+    """
+    if not isinstance(cohort, Cohort):
+        raise InputError(
+            f"aggregate_cohort: cohort is a {type(cohort).__name__}; hilbo.study.cohort.cohort_of(table, study) makes"
+            " one of a table."
+        )
+    study = resolved(study, cohort)
+    candidates = search_points(study.space, seed)
+    posteriors = fit_cohort(study, cohort)
+    share = share_of(study.gp, cohort.trials, study.inference) if study.rule == "hierarchical" else None
+    map_ = _rule_map(study, cohort, study.rule, posteriors, share)
+    optimum = map_optimum(study, map_, candidates)
+    first(optimum, map_)
+    beside = alternatives and study.rule not in RECIPES
+    with ThreadPoolExecutor(1) as other_core:  # for what does not wait for the share
+        individuals = other_core.submit(individual_optima, study, posteriors, candidates)
+        by_other = other_core.submit(_by_other_inference, study, cohort, candidates, share) if beside else None
+        if share is None and beside and np.sum(cohort.counts() > 0) > 1:
+            share = share_of(study.gp, cohort.trials, study.inference)
+        rules = _rules(study, cohort, share) if alternatives else [study.rule]
+        maps = {rule: _rule_map(study, cohort, rule, posteriors, share) for rule in rules if rule != study.rule}
+        others = {rule: map_optimum(study, other_map, candidates) for rule, other_map in maps.items()}
+    if by_other is not None:
+        other = other_inference(study)
+        maps[other], others[other] = by_other.result()
+    return Aggregate(
+        cohort=cohort,
+        posteriors=posteriors,
+        optimum=optimum,
+        individuals=individuals.result(),
+        alternatives=others,
+        map=map_,
+        maps={study.rule: map_} | maps,
+        share=share,
+    )
+
+
+def _by_other_inference(
+    study: Study, cohort: Cohort, candidates: Float[Array, "m d"], share: Share | None
+) -> tuple[RuleMap, Optimum]:
+    """The map by the study's rule and its optimum, where everybody is fitted by the other inference."""
+    other = other_inference(study)
+    map_ = _rule_map(study, cohort, study.rule, fit_cohort(study, cohort, inference=other), share, other)
+    return map_, map_optimum(study, map_, candidates)
+
+
+def _rules(study: Study, cohort: Cohort, share: Share | None) -> list[str]:
+    """The study's rule, and those whose optima stand beside its own, as far as these answers allow them."""
+    few = cohort.counts().sum() <= _LARGEST_POOL
+    beside = [*(["hierarchical"] if share is not None else []), "bcm", "average", *(["pooled"] if few else [])]
+    return list(dict.fromkeys([study.rule, *beside]))
+
+
+def _rule_map(
+    study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: Share | None, inference: str | None = None
+) -> RuleMap:
+    """The map by a rule from everybody's posteriors, or from all answers where the rule takes them at once."""
+    if rule in RECIPES:
+        assert study.learnt is not None
+        return learnt_map(study.learnt, cohort.trials)
+    return rule_map(
+        study.gp,
+        cohort.trials,
+        rule,
+        posteriors=posteriors,
+        share=None if share is None else share.mean,
+        inference=study.inference if inference is None else inference,
+        largest=_LARGEST_POOL if rule == "pooled" else LARGEST_EXACT,
+    )
+
+
+def asked_variance(map_: RuleMap, cohort: Cohort) -> Float[Array, ""]:
+    """Largest variance of a map at a point that somebody answered. A scalar."""
+    if map_.reach is not None:
+        return map_.reach
+    points = np.unique(np.asarray(cohort.trials.x)[np.asarray(cohort.trials.mask)], axis=0)
+    return placed(np.asarray(predict_map(map_, placed(points))[1]).max())

@@ -1,0 +1,141 @@
+"""A study whose rule learns the hyperparameters, once its answers are there: the learnt model, and the words for it."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hilbo.errors import InputError
+from hilbo.population.learnt.posterior import Stated, prior_model
+from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED
+from hilbo.population.learnt.rule import Learnt, learn
+from hilbo.population.maps import ALL_RULES, RuleMap
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+
+__all__ = ["by_rule", "effect_content", "learnt_content", "learnt_sentences", "resolved", "that_learns"]
+
+_UNKNOWN = 0.9  # of the prior's standard deviation: the answers hardly say more
+
+
+def that_learns(study: Study, recipe: str = RECOMMENDED) -> Study:
+    """The same study by a recipe that learns: nothing of its [gp] is kept."""
+    stated = Stated(levels=study.stated.levels)
+    gp = prior_model(study.space.dim, len(study.responses), stated)
+    return dataclasses.replace(study, rule=recipe, gp=gp, inference="laplace", stated=stated, learnt=None)
+
+
+def by_rule(study: Study, rule: str) -> Study:
+    """The same study by another rule of aggregation. Raises InputError for a rule that there is not, and for one that
+    needs a [gp] where the study learns its own."""
+    if rule == study.rule:
+        return study
+    if rule not in ALL_RULES:
+        raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
+    if rule in RECIPES:
+        return that_learns(study, rule)
+    if study.rule in RECIPES:
+        raise InputError(f'--rule is "{rule}", and the study, whose rule is "{study.rule}", has no [gp] for it.')
+    return dataclasses.replace(study, rule=rule)
+
+
+def resolved(study: Study, cohort: Cohort) -> Study:
+    """The study with the model that its answers say, where its rule learns; else the study itself."""
+    if study.rule not in RECIPES or study.learnt is not None:
+        return study
+    learnt = learn(cohort.trials, len(study.responses), study.stated, RECIPES[study.rule])
+    return dataclasses.replace(study, gp=learnt.model.gp, learnt=learnt)
+
+
+def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
+    """What was learnt, for result.json: the resolved recipe, medians with 95 % intervals, and what is not identified;
+    `names` are the participants'."""
+    learnt = study.learnt
+    if learnt is None:
+        return None
+    model = learnt.model
+    content: dict[str, Any] = {
+        "recipe": learnt.recipe,
+        "stated": study.stated.numbers,
+        "noise": float(model.noise),
+        "theta": dict(zip(study.space.names, np.asarray(model.theta).tolist(), strict=True)),
+        "shared_variance": float(model.shared),
+        "own_variance": float(model.own),
+        "share": float(model.share),
+        "thresholds": np.asarray(model.thresholds).tolist(),
+        "log_evidence": float(learnt.log_evidence),
+        "steps": int(learnt.steps),
+        "converged": bool(learnt.converged),
+    }
+    content["intervals"] = {name: list(ends) for name, ends, _ in _coordinates(study, learnt)}
+    content["not_identified"] = [name for name, _, known in _coordinates(study, learnt) if not known]
+    if learnt.widths:
+        widths, sd = (np.asarray(part["widths"]) for part in (learnt.coordinates, learnt.sd))
+        ends = np.exp(np.stack([widths, widths - 1.96 * sd, widths + 1.96 * sd], axis=1)).tolist()
+        content["widths"] = {
+            name: {"width": width, "interval": [low, high]}
+            for name, (width, low, high) in zip(names, ends, strict=True)
+        }
+    return content
+
+
+def effect_content(study: Study, cohort: Cohort, map_: RuleMap) -> dict[str, Any] | None:
+    """The random effect, for result.json: the variance that was learnt, and what each level with an answer adds to
+    everybody's latent score, with its standard deviation. None where the map has none."""
+    effects, trials = map_.effects, cohort.trials
+    if effects is None:
+        return None
+    present = np.unique(np.asarray(trials.context)[np.asarray(trials.mask)])
+    means, sds = np.asarray(effects.mean)[present], np.sqrt(np.asarray(effects.variance)[present])
+    return {
+        "column": study.random_effect,
+        "variance": float(effects.prior),
+        "levels": {
+            cohort.contexts[c]: {"mean": mean, "sd": sd}
+            for c, mean, sd in zip(present, means.tolist(), sds.tolist(), strict=True)
+        },
+    }
+
+
+def _coordinates(study: Study, learnt: Learnt) -> list[tuple[str, tuple[float, float], bool]]:
+    """Name, 95 % interval and whether the answers say more than the prior, of what is learnt of all people. In units
+    of the noise: distances between thresholds, and variances."""
+    rows = []
+    for name, value in learnt.coordinates.items():
+        if name == "widths":
+            continue
+        means, sds = np.atleast_1d(np.asarray(value)), np.atleast_1d(np.asarray(learnt.sd[name]))
+        labels = [f"theta.{p}" for p in study.space.names] if name == "theta" else [name]
+        labels = [f"gap {i + 1}" for i in range(len(means))] if name == "gaps" else labels
+        labels = ["random effect"] if name == "effect" else labels
+        for label, mean, sd in zip(labels, means.tolist(), sds.tolist(), strict=True):
+            ends = mean - 1.96 * sd, mean + 1.96 * sd
+            ends = ends if name == "middle" else (math.exp(ends[0]), math.exp(ends[1]))
+            known = math.isfinite(sd) and sd < _UNKNOWN * RECIPES[learnt.recipe].priors[name].sd
+            rows.append((label, ends, known))
+    return rows
+
+
+def learnt_sentences(study: Study) -> list[str]:
+    """What must be said of a learnt model: what it could not learn, and what may bend it."""
+    learnt = study.learnt
+    if learnt is None:
+        return []
+    sentences = []
+    unknown = [name for name, _, known in _coordinates(study, learnt) if not known]
+    if unknown:
+        sentences.append(
+            f"Not identified by these answers, so that the prior decides: {', '.join(unknown)} (rule {learnt.recipe})."
+        )
+    if study.stated.thresholds is not None and study.stated.theta is None:
+        sentences.append(
+            "The study states the thresholds and learns theta: lengths that are learnt beside thresholds that do not"
+            " fit the answers mislead; leave gp.thresholds out."
+        )
+    if not bool(learnt.converged):
+        sentences.append(
+            "The search for the hyperparameters did not end well; compare the optimum with that of another rule."
+        )
+    return sentences

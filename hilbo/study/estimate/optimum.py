@@ -1,0 +1,249 @@
+"""Optima of maps: where a population's map, or one person's posterior mean, is largest in the feasible set.
+
+A population's map is a committee machine over posteriors (`hilbo.bcm`), or what a rule says (`hilbo.population.maps`);
+its optimum is searched like a session's.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from hilbo import acquisition, bcm
+from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.climbing import Choice
+from hilbo.numerics.shown import shown
+from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import OrdinalGP, Posterior
+from hilbo.population import pointwise
+from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.maps import RuleMap
+from hilbo.population.newcomer import class_probabilities, log_highest
+from hilbo.search.space import SearchSpace
+from hilbo.study.config import Study
+from hilbo.study.estimate.best_places import best_places, nearness
+
+__all__ = [
+    "Optimum",
+    "best_point",
+    "individual_optima",
+    "map_optimum",
+    "population_optimum",
+    "predict_map",
+    "predict_people",
+]
+
+Rule = pointwise.Rule
+_LOSS = 0.05  # of the probability of the highest answer, for an optimum in the middle of where the best may be
+
+
+class Optimum(eqx.Module):
+    """A point of the unit cube at which a map is largest, and the map there; leading axes for several.
+
+    Of a population, `mean` and `sd` are the map's own, and the class probabilities those of a new person's answer.
+    """
+
+    x: Float[Array, "*s d"]
+    mean: Float[Array, "*s"]
+    sd: Float[Array, "*s"]
+    class_probabilities: Float[Array, "*s C"]
+
+    def __repr__(self) -> str:
+        f, chances = f"{shown(self.mean)} ± {shown(self.sd)}", shown(self.class_probabilities)
+        return f"Optimum(x={shown(self.x)} of the unit cube, f = {f}, answers {chances})"
+
+
+@program
+def predict_people(
+    posteriors: Posterior, x: Float[Array, "m d"], rule: Rule = "bcm", share: Float[Array, ""] | None = None
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Mean and variance (m,) of the population map at points of the unit cube, aggregated point by point.
+
+    Of bcm, participants' predictions are made in blocks and never held all at once. `share`: of the hierarchical rule.
+    """
+    prior = jax.vmap(jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel.diagonal)(x)
+    if rule != "bcm":
+        means, explained = jax.vmap(lambda p: p.predict_explained(x))(posteriors)
+        return pointwise.aggregate(rule, means, explained, prior, share=share)
+    evidence = bcm.stream(lambda p: p.predict_explained(x), posteriors, prior)
+    return evidence.merge(prior)
+
+
+def predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Mean and variance (m,) of a population map at points of the unit cube; bcm's as a stream over people."""
+    return _predict_map(_nameless(map_), x)
+
+
+@program
+def _predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    return predict_people(map_.experts, x) if map_.rule == "bcm" and map_.experts is not None else map_.predict(x)
+
+
+def population_optimum(
+    study: Study,
+    posteriors: Posterior,
+    candidates: Float[Array, "m d"],
+    rule: Rule = "bcm",
+    share: Float[Array, ""] | None = None,
+) -> Optimum:
+    """Where the population map's mean is largest in the feasible set.
+
+    `posteriors`: stacked, M people; `candidates` (m, d) feasible points of the unit cube.
+    """
+    return _population_optimum(study.gp, study.space, posteriors, candidates, rule, share)
+
+
+@program
+def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidates, rule, share) -> Optimum:
+    apart = 0.0 if share is None else (1.0 - share) * gp.kernel.variance
+    values = predict_people(posteriors, candidates, rule, share)[0]
+    return _optimum(
+        gp.likelihood, space, lambda x: predict_people(posteriors, x, rule, share), candidates, values, apart
+    )
+
+
+def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
+    """Where a rule's map has its largest mean in the feasible set; by a recipe that learns where a new person answers
+    with the highest category most often; or what the best rendering is most often near, of places where a new person
+    does so at most `_LOSS` less often. Among points of which the answers tell as much as of some that were asked.
+    `candidates` (m, d): feasible points of the unit cube, where the search begins.
+    """
+    if map_.centred:
+        assert map_.shared is not None
+        places = best_places(study.space, [map_.shared])
+        return _centre(study.gp.likelihood, study.space, map_, candidates, places.points, places.share)
+    return _map_optimum(study.gp.likelihood, study.space, _nameless(map_), candidates)
+
+
+def _nameless(map_: RuleMap) -> RuleMap:
+    """The map without the name of its rule where it predicts alike by all: from one function's posterior. One program
+    then serves them."""
+    exact = map_.method == "exact" and map_.rule not in RECIPES
+    return dataclasses.replace(map_, rule="hierarchical") if exact else map_
+
+
+@program
+def _map_optimum(
+    likelihood: OrdinalProbit, space: SearchSpace, map_: RuleMap, candidates: Float[Array, "m d"]
+) -> Optimum:
+    if map_.rule not in RECIPES:
+        single = jnp.float32  # which ranks the candidates; the best are scored again
+        values = predict_map(map_.astype(single), candidates.astype(single))[0]
+        return _optimum(likelihood, space, lambda x: predict_map(map_, x), candidates, values, map_.apart)
+
+    log_chance = partial(_log_chance, likelihood, map_)
+    mean, variance = map_.predict(candidates)
+    surest = _reach(map_, variance)
+    return _optimum(
+        likelihood,
+        space,
+        map_.predict,
+        candidates,
+        log_chance(mean, variance),
+        map_.apart,
+        lambda x: log_chance(*map_.predict(x[None, :]))[0],
+        lambda x: map_.predict(x[None, :])[1][0] <= surest,
+        map_.widths,
+    )
+
+
+@program
+def _centre(
+    likelihood: OrdinalProbit,
+    space: SearchSpace,
+    map_: RuleMap,
+    candidates: Float[Array, "m d"],
+    places: Float[Array, "p d"],
+    share: Float[Array, " p"],
+) -> Optimum:
+    """What the best rendering is most often near, where a new person gives the highest answer nearly as often as at the
+    best of the candidates; `share`: how often each of the places was the best of a draw."""
+    assert map_.shared is not None
+    near = partial(nearness, map_.shared.gp.kernel, places, share)
+    mean, variance = map_.predict(candidates)
+    surest = _reach(map_, variance)
+    chances = jnp.exp(_log_chance(likelihood, map_, mean, variance))
+    least = jnp.max(jnp.where(variance <= surest, chances, 0.0)) - _LOSS
+
+    def allowed(x):
+        mean, variance = map_.predict(x[None, :])
+        return (variance[0] <= surest) & (jnp.exp(_log_chance(likelihood, map_, mean, variance)[0]) >= least)
+
+    values = jax.vmap(near)(candidates)
+    return _optimum(likelihood, space, map_.predict, candidates, values, map_.apart, near, allowed, map_.widths)
+
+
+def _log_chance(
+    likelihood: OrdinalProbit, map_: RuleMap, mean: Float[Array, " m"], variance: Float[Array, " m"]
+) -> Float[Array, " m"]:
+    """Log probability of a new person's highest answer, by means and variances of the map."""
+    return log_highest(likelihood, mean, variance + map_.apart, map_.widths)
+
+
+def _reach(map_: RuleMap, variances: Float[Array, " m"]) -> Float[Array, ""]:
+    """Largest variance that an optimum may have: that of some point that was asked; or the candidates' least."""
+    assert map_.reach is not None
+    return jnp.maximum(map_.reach, jnp.min(variances))
+
+
+def _optimum(
+    likelihood: OrdinalProbit,
+    space: SearchSpace,
+    predict: Callable,
+    candidates: Float[Array, "m d"],
+    values: Float[Array, " m"],
+    apart: ArrayLike,
+    score: Callable[[Float[Array, " d"]], Float[Array, ""]] | None = None,
+    allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
+    widths: bool = False,
+) -> Optimum:
+    """`values`: of the candidates, by which they are ranked; `apart`: variance of one person's function about the
+    map's; `score`: what is largest at the optimum, by default the mean; `allowed`: where it may be; `widths`: whether
+    people differ in them."""
+    choice = acquisition.maximise(
+        values,
+        candidates,
+        (lambda x: predict(x[None, :])[0][0]) if score is None else score,
+        **space.searched,
+        allowed=allowed,
+        steps=300,
+    )
+    mean, variance = predict(choice.x[None, :])
+    probabilities = class_probabilities(likelihood, mean, variance + apart, widths)[0]
+    return Optimum(choice.x, mean[0], jnp.sqrt(variance[0]), probabilities)
+
+
+def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
+    """Where each participant's posterior mean is largest in the feasible set, stacked; one after the other.
+
+    `posteriors`: stacked, M people; `candidates` (m, d) feasible points of the unit cube. All arrays of the result
+    begin with M.
+    """
+    return _individual_optima(study.space, posteriors, candidates)
+
+
+@program
+def _individual_optima(space: SearchSpace, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
+    def one(posterior):
+        x = best_point(space, posterior, candidates).x
+        mean, variance = posterior.predict(x[None, :])
+        probabilities = posterior.gp.likelihood.class_probabilities(mean[0], variance[0])
+        return Optimum(x, mean[0], jnp.sqrt(variance[0]), probabilities)
+
+    # On a CPU one after the other: each search stops when it is done, where a batch waits for its slowest.
+    return jax.lax.map(one, posteriors, batch_size=None if jax.default_backend() == "cpu" else 256)
+
+
+def best_point(space: SearchSpace, posterior: Posterior, candidates: Float[Array, "m d"]) -> Choice:
+    """Where the posterior mean is largest in the feasible set (paper, algorithm 1), searched from `candidates`."""
+    return acquisition.maximise(
+        posterior.astype(jnp.float32).mean(candidates.astype(jnp.float32)),
+        candidates,
+        lambda x: posterior.mean(x[None, :])[0],
+        **space.searched,
+    )

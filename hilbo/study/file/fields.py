@@ -1,0 +1,165 @@
+"""What reads the tables of a study file: every key known and of its type, every mistake one sentence with its place.
+
+A table is a `Table` (msgspec) whose annotations carry the type, the range and the words for both; a field that is
+itself a `Table` is a table within the table.
+"""
+
+import json
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.study.formats.cell_text import FORMULA_WORDS, runs_in_a_spreadsheet
+
+__all__ = [
+    "Name",
+    "NotNegative",
+    "Number",
+    "Positive",
+    "Table",
+    "check_keys",
+    "check_present",
+    "check_table",
+    "enclosing",
+    "lines_of",
+    "missing_keys",
+    "prefix",
+    "read_table",
+    "shown",
+    "words",
+]
+
+
+def words(description: str, example: str) -> msgspec.Meta:
+    """What a value must be, in words, and how one is written."""
+    return msgspec.Meta(description=description, examples=[example])
+
+
+Number = Annotated[float, msgspec.Meta(description="a finite number")]
+Positive = Annotated[float, msgspec.Meta(gt=0, description="a number above 0")]
+NotNegative = Annotated[float, msgspec.Meta(ge=0, description="a number, 0 or above")]
+Name = Annotated[str, msgspec.Meta(min_length=1), words("a text", '"memory foam"')]
+
+
+class Table(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One table of the study file."""
+
+
+_T = TypeVar("_T", bound=Table)
+
+
+def read_table(kind: type[_T], raw: Any, path: str) -> _T:
+    """A parsed table as its record. Raises `InputError` with the key's path first."""
+    fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
+    check_present(missing_keys(kind, raw, path))
+    return kind(**{key: _read_field(fields[key].type, value, f"{path}.{key}") for key, value in raw.items()})
+
+
+def _read_field(kind: Any, raw: Any, path: str) -> Any:
+    """A value as its type: a table within the table, or a value of its own."""
+    if isinstance(kind, type) and issubclass(kind, Table):
+        return read_table(kind, raw, path)
+    return _read_value(kind, raw, path)
+
+
+def _read_value(kind: Any, raw: Any, path: str) -> Any:
+    """A checked value; the sentence where it is none is made of the words of its annotation."""
+    try:
+        value = msgspec.convert(raw, kind)
+        parts = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(v, str) and runs_in_a_spreadsheet(v) for v in parts):
+            raise InputError(f"{path} is {shown(value)}, {FORMULA_WORDS}.")
+        if all(math.isfinite(v) for v in parts if isinstance(v, float)):
+            return value
+    except msgspec.ValidationError:
+        pass  # its text speaks of types and of `$`; the schema has the words
+    notes = [note for note in kind.__metadata__ if isinstance(note, msgspec.Meta)]
+    must = next(note.description for note in reversed(notes) if note.description)
+    example = next((f"; write for example {path.split('.')[-1]} = {n.examples[0]}" for n in notes if n.examples), "")
+    raise InputError(f"{path} is {shown(raw)}; it must be {must}{example}.")
+
+
+def check_keys(raw: Any, path: str, known: Iterable[str]) -> None:
+    """Refuse what is no table, or has a key that is not known."""
+    check_table(raw, path)
+    dot = f"{path}." if path else ""
+    for key in raw:
+        if key not in known:
+            raise InputError(f"{dot}{key} is not a key of a study file; known here are {', '.join(known)}.")
+
+
+def missing_keys(kind: type[Table], raw: Any, path: str) -> Iterator[str]:
+    """Paths of the required keys that a parsed table lacks, and of those that the tables within it lack.
+
+    Raises `InputError` for what is no table, or has a key that is not known: it may be a missing one, misspelt."""
+    fields = msgspec.structs.fields(kind)
+    check_keys(raw, path, [field.encode_name for field in fields])
+    for field in fields:
+        key = f"{path}.{field.encode_name}"
+        if field.encode_name in raw and isinstance(field.type, type) and issubclass(field.type, Table):
+            yield from missing_keys(field.type, raw[field.encode_name], key)
+        elif field.required and field.encode_name not in raw:
+            yield key
+
+
+def check_present(missing: Iterable[str], rest: str = "") -> None:
+    """Refuse what lacks these keys, all of them in one sentence, which `rest` ends."""
+    keys = list(missing)
+    if keys:
+        first, *others = keys
+        also = f" and so {'is' if len(others) == 1 else 'are'} {', '.join(others)}" if others else ""
+        raise InputError(f"{first} is missing{also}; add {'them' if others else 'it'}{rest}.")
+
+
+def check_table(raw: Any, path: str) -> Mapping[str, Any]:
+    """The table; refuses what is none, and one whose name would be run as a formula at the head of a column."""
+    if runs_in_a_spreadsheet(path.partition(".")[2]):
+        raise InputError(f"{path} has a name {FORMULA_WORDS}.")
+    if not isinstance(raw, Mapping):
+        raise InputError(f"{path} is {shown(raw)}; it must be a table; write it as [{path}].")
+    return raw
+
+
+def shown(value: Any) -> str:
+    """A value as it stands in a sentence."""
+    return json.dumps(value, ensure_ascii=False, default=str)
+
+
+def prefix(source: str, line: int | None = None) -> str:
+    """`file:line: `, or nothing where there is no file."""
+    place = source if line is None else f"{source}:{line}"
+    return f"{place}: " if place else ""
+
+
+def enclosing(path: str, place: str) -> Iterator[str]:
+    """The key path and the tables around it, innermost first; for a material then those of the study itself."""
+    parts = path.rstrip(",:").split(".")
+    yield from (".".join(parts[:n]) for n in range(len(parts), len(place.split(".")) - 1 if place else 0, -1))
+    if place:
+        yield from enclosing(path.removeprefix(place), "")
+
+
+def lines_of(text: str) -> dict[str, int]:
+    """Line number of every table and key in the file."""
+    lines, table, counts = {}, "", Counter()
+    for number, line in enumerate(text.splitlines(), 1):
+        if header := re.match(r"\s*\[([^\[\]]+)\]", line):
+            table = _path(header[1])
+            lines.setdefault(table, number)
+        elif header := re.match(r"\s*\[\[([^\[\]]+)\]\]", line):  # tables of one name, called by their number
+            counts[_path(header[1])] += 1
+            table = f"{_path(header[1])}.{counts[_path(header[1])]}"
+            lines[table] = number
+        elif key := re.match(r"""\s*([\w."' -]+?)\s*=""", line):
+            lines.setdefault(f"{table}.{_path(key[1])}" if table else _path(key[1]), number)
+    return lines
+
+
+def _path(key: str) -> str:
+    """A key as it stands in the file, without its quotes and blanks."""
+    return ".".join(word.strip().strip("\"'") for word in key.split("."))

@@ -1,0 +1,185 @@
+"""The schema of a study file: each table as a record, whose annotations carry the type, the range and the words for
+both. Loads no JAX."""
+
+from typing import Annotated, Any, Literal, get_args
+
+import msgspec
+
+from hilbo.mechanics.span import Memory
+from hilbo.study.file.fields import NotNegative as _NotNegative
+from hilbo.study.file.fields import Number as _Number
+from hilbo.study.file.fields import Positive as _Positive
+from hilbo.study.file.fields import Table as _Table
+from hilbo.study.file.fields import words as _text
+from hilbo.study.file.protocols import SessionTable
+from hilbo.study.file.simulated_people import SimulationTable
+from hilbo.study.file.stimuli import StimulusTable
+from hilbo.study.file.trial_flags import FLAGS, TrialFlag
+
+__all__ = [
+    "LEARN",
+    "NO_DELAY",
+    "TABLES",
+    "ConstraintTable",
+    "GPTable",
+    "Inference",
+    "LevelsTable",
+    "ParameterTable",
+    "RendererTable",
+    "ReportTable",
+    "Rule",
+    "Selection",
+    "Tables",
+]
+
+Inference = Literal["laplace", "ep", "ep_corrected", "exact"]
+Rule = Literal["bcm", "hierarchical", "rbcm", "average", "pooled", "learnt-1", "learnt-2"]
+"""How people are aggregated; `hilbo.population.maps` has the rules."""
+LEARN: tuple[Rule, ...] = ("learnt-1", "learnt-2")
+"""The rules that learn what [gp] leaves out."""
+Acquisition = Literal["ucb", "log_ei", "thompson", "top_category", "mean"]
+
+
+class StudyTable(_Table, frozen=True):
+    name: Annotated[str, msgspec.Meta(min_length=1), _text("a text", '"memory foam"')]
+    responses: Annotated[
+        tuple[str, ...],
+        msgspec.Meta(min_length=2),
+        _text("a list of two or more texts, lowest first", '["different", "similar", "close"]'),
+    ]
+    attribute: Annotated[str, msgspec.Meta(min_length=1), _text("a text", '"perceived realism"')] = "perceived realism"
+    exclude: Annotated[str, _text("a rule, or nothing", '"trials < 10 or lapse_low > 0.3"')] = ""
+    exclude_flags: Annotated[
+        tuple[TrialFlag, ...], _text("a list of some of " + ", ".join(FLAGS), '["saturated", "slewed"]')
+    ] = ()
+
+
+class ParameterTable(_Table, frozen=True):
+    low: _Number
+    high: _Number
+    unit: Annotated[str, _text("a text", '"N/mm"')] = ""
+    scale: Annotated[Literal["linear", "log"], _text('"linear" or "log"', '"linear"')] = "linear"
+    integer: Annotated[bool, _text("true or false", "true")] = False
+
+
+class LevelsTable(_Table, frozen=True):
+    """A parameter of unordered levels. `correlation`: of the latent score at two of them, before any answer."""
+
+    levels: Annotated[
+        tuple[Annotated[str, msgspec.Meta(min_length=1)], ...],
+        msgspec.Meta(min_length=2),
+        _text("a list of two or more texts", '["silk", "wood", "stone"]'),
+    ]
+    correlation: Annotated[float, msgspec.Meta(gt=0, lt=1), _text("a number above 0 and below 1", "0.5")] = 0.5
+
+
+class ConstraintTable(_Table, frozen=True):
+    """`least` <= the sum of weight times parameter <= `most`, in physical units."""
+
+    terms: Annotated[
+        dict[str, float], msgspec.Meta(min_length=1), _text("a table of weights", "{gain = 1, delay = 0.5}")
+    ]
+    least: _Number | None = None
+    most: _Number | None = None
+
+
+NO_DELAY = 0.0
+"""msgspec leaves a number out of the content where it is this very object."""
+
+
+class RendererTable(_Table, frozen=True):
+    K_eff: Annotated[_NotNegative, msgspec.Meta(examples=["0.44"])]
+    damping: Annotated[_Positive, msgspec.Meta(examples=["0.95"])]
+    model: Annotated[Literal["fosls"], _text('"fosls"', '"fosls"')] = "fosls"
+    memory: Annotated[Memory, _text('"short" or "full"', '"short"')] = "short"
+    N: Annotated[int, msgspec.Meta(ge=1), _text("an odd whole number, 1 or above", "101")] = 101
+    states: Annotated[int, _text("a number of exponentials, for full memory", "10")] = 10
+    T: Annotated[_Positive, msgspec.Meta(examples=["0.001"])] = 1e-3
+    effective_damping: Annotated[tuple[float, float] | None, _text("a list of two numbers", "[10, 80]")] = None
+    delay: Annotated[_NotNegative, msgspec.Meta(examples=["0.0003"])] = NO_DELAY
+
+
+_Length = Annotated[float, msgspec.Meta(ge=1e-3, le=1e3)]
+
+
+class GPTable(_Table, frozen=True):
+    """[gp]. What is left out is learnt; rules that do not learn require theta or length, and all but `inference`.
+
+    `length`: over which answers change, as a part of a parameter's range; theta = 1/(2 length^2).
+    """
+
+    theta: Annotated[
+        _Positive | Annotated[tuple[_Positive, ...], msgspec.Meta(min_length=1)] | None,
+        _text("a number above 0, or a list of one for each parameter", "30.0"),
+    ] = None
+    length: Annotated[
+        _Length | Annotated[tuple[_Length, ...], msgspec.Meta(min_length=1)] | None,
+        _text("a number from 0.001 to 1000, or a list of one for each parameter", "0.3"),
+    ] = None
+    variance: Annotated[_Positive | None, _text("a number above 0", "1.0")] = None
+    thresholds: Annotated[tuple[float, ...] | None, _text("a list of rising numbers", "[-0.5, 0.5]")] = None
+    noise: Annotated[_Positive | None, _text("a number above 0", "0.5")] = None
+    inference: Annotated[Inference, _text('"laplace", "ep", "ep_corrected" or "exact"', '"laplace"')] = "laplace"
+
+
+class Selection(_Table, frozen=True):
+    """How trials are chosen: first `space_filling` of them by a Latin hypercube, then by the acquisition function.
+
+    `weight`: of the standard deviation in UCB. `minimum_distance`: to earlier trials, in the unit cube.
+    """
+
+    space_filling: Annotated[int, msgspec.Meta(ge=0), _text("a whole number, 0 or above", "5")] = 5
+    trials: Annotated[int, msgspec.Meta(ge=1), _text("a whole number, 1 or above", "25")] = 25
+    acquisition: Annotated[
+        Acquisition, _text("one of " + ", ".join(f'"{name}"' for name in get_args(Acquisition)), '"ucb"')
+    ] = "ucb"
+    weight: Annotated[_NotNegative, msgspec.Meta(examples=["0.7"])] = 0.7
+    minimum_distance: Annotated[_NotNegative | None, _text("a number, 0 or above", "0.05")] = None
+
+
+class AggregationTable(_Table, frozen=True):
+    rule: Annotated[Rule, _text("one of " + ", ".join(f'"{name}"' for name in get_args(Rule)), '"bcm"')] = "bcm"
+
+
+class RandomEffectTable(_Table, frozen=True):
+    """`column`: of the answers' table, such as the clip, whose levels add something of their own."""
+
+    column: Annotated[str, msgspec.Meta(min_length=1), _text("the name of a column", '"clip"')]
+
+
+class ReportTable(_Table, frozen=True):
+    """What `hilbo report` says besides. `hypotheses`: what the results say of the paper's hypotheses H1 to H4, and
+    which figure is which of the paper's."""
+
+    hypotheses: Annotated[bool, _text("true or false", "true")] = False
+
+
+class Tables(_Table, frozen=True):
+    """The whole file: what the hash is taken of."""
+
+    study: StudyTable
+    parameters: dict[str, ParameterTable | LevelsTable]
+    gp: GPTable = GPTable()
+    renderer: RendererTable | None = None
+    selection: Selection = Selection()
+    aggregation: AggregationTable = AggregationTable()
+    materials: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
+    session: SessionTable = SessionTable()
+    report: ReportTable = ReportTable()
+    stimulus: StimulusTable | None = None
+    simulation: SimulationTable | None = None
+    random_effect: RandomEffectTable | None = None
+    constraints: tuple[ConstraintTable, ...] = ()
+
+
+TABLES = {
+    "study": StudyTable,
+    "gp": GPTable,
+    "selection": Selection,
+    "aggregation": AggregationTable,
+    "session": SessionTable,
+    "report": ReportTable,
+    "stimulus": StimulusTable,
+    "simulation": SimulationTable,
+    "random_effect": RandomEffectTable,
+}

@@ -1,0 +1,71 @@
+"""[simulation]: the people that `hilbo simulate` and `hilbo power` draw for a study, where no preset is asked for."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Annotated
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.search.box import Parameter
+from hilbo.study.file.fields import NotNegative, Positive, Table, shown, words
+
+__all__ = ["SimulationTable", "each"]
+
+_Part = Annotated[float, msgspec.Meta(gt=0, le=1)]
+_Parts = Annotated[
+    _Part | Annotated[tuple[_Part, ...], msgspec.Meta(min_length=1)],
+    words("a number above 0, up to 1, or a list of one for each parameter", "0.15"),
+]
+
+
+class SimulationTable(Table, frozen=True):
+    """People of whom each prefers one rendering; `hilbo.simulation.simulate` has the model.
+
+    `truth`: parameter -> where their optima lie, physical units; drawn from what may be rendered where it is not
+    stated. `spread`: sd of optima between people, of levels the share who prefer another one, and `tolerance`: the
+    distance at which the highest answer is left, both in parts of the ranges. `criteria`: C - 1 falling distances in
+    tolerances, below the last of which the answer is the highest. `noise`: sd of what is felt, in tolerances. `lapse`:
+    share of answers that are guesses.
+    """
+
+    truth: Annotated[dict[str, float | str], words("a table of numbers or levels", "{hue = 120}")] = msgspec.field(
+        default_factory=dict
+    )
+    spread: _Parts = 0.12
+    tolerance: _Parts = 0.2
+    tolerance_sd: NotNegative = 0.4
+    criteria: Annotated[tuple[Positive, ...], words("a list of falling numbers above 0", "[2.5, 1]")] = ()
+    noise: Annotated[Positive, msgspec.Meta(examples=["0.7"])] = 0.7
+    lapse: Annotated[float, msgspec.Meta(ge=0, le=1), words("a number from 0 to 1", "0.05")] = 0.05
+    drift_sd: NotNegative = 0.2
+
+    def check(self, parameters: Sequence[Parameter], count: int) -> None:
+        """Refuse what does not fit these parameters and `count` responses. Raises `InputError`."""
+        names = [p.name for p in parameters]
+        if self.truth and set(self.truth) != set(names):
+            raise InputError(f"simulation.truth names {', '.join(self.truth)}; it must name {', '.join(names)}.")
+        for p in parameters if self.truth else ():
+            if not p.low <= p.number(self.truth[p.name]) <= p.high:
+                value = shown(self.truth[p.name])
+                raise InputError(f"simulation.truth.{p.name} is {value}; it must be {p.range_words}.")
+        for name, values in (("spread", self.spread), ("tolerance", self.tolerance)):
+            if isinstance(values, tuple) and len(values) != len(names):
+                raise InputError(
+                    f"simulation.{name} has {len(values)} numbers; it must be one number or {len(names)}, one per"
+                    " parameter."
+                )
+        if self.criteria and len(self.criteria) != count - 1:
+            given = shown(self.criteria)
+            raise InputError(
+                f"simulation.criteria is {given}; it must have one number fewer than the {count} responses."
+            )
+        if any(high <= low for high, low in itertools.pairwise(self.criteria)):
+            raise InputError(
+                f"simulation.criteria is {shown(self.criteria)}; it must fall from each number to the next."
+            )
+
+
+def each(values: float | tuple[float, ...], dim: int) -> tuple[float, ...]:
+    """One number for each of `dim` parameters."""
+    return values if isinstance(values, tuple) else (values,) * dim

@@ -1,0 +1,202 @@
+"""The tables of a study file: read as records, checked, and what must fit together. Loads no JAX."""
+
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, get_args
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.search.box import Box, Constraint, Mechanics, Parameter
+from hilbo.study.file.fields import check_keys, check_present, check_table, missing_keys, read_table, shown
+from hilbo.study.file.reserved_names import TRIAL_COLUMNS, is_reserved
+from hilbo.study.file.schema import (
+    LEARN,
+    NO_DELAY,
+    TABLES,
+    ConstraintTable,
+    GPTable,
+    LevelsTable,
+    ParameterTable,
+    RendererTable,
+    Rule,
+    Tables,
+)
+
+__all__ = ["box_of", "check_together", "of_material", "read"]
+
+_REQUIRED = ("schema", "study", "parameters")
+_KEYS = ("schema", "study", "parameters", "renderer", *list(TABLES)[1:], "constraints", "materials")
+_LEARNT = ("theta", "variance", "thresholds", "noise")
+_OVERRIDES = ("renderer", "parameters")
+_NUMBERS_KEYS = ("low", "high", "unit", "scale", "integer")
+_UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
+
+
+def read(raw: Mapping[str, Any]) -> Tables:
+    """The parsed file as records, every key known and of its type. Raises `InputError`."""
+    check_keys(raw, "", _KEYS)
+    _check_complete(raw)
+    if raw["schema"] is True or raw["schema"] != 1:
+        raise InputError(f"schema is {shown(raw['schema'])}; it must be 1: this hilbo reads no other.")
+    tables = {key: read_table(kind, raw[key], key) for key, kind in TABLES.items() if key in raw}
+    parameters = {
+        name: read_table(_kind_of(table), table, f"parameters.{name}") for name, table in raw["parameters"].items()
+    }
+    if "gp" in tables:
+        tables["gp"] = _with_theta(tables["gp"], parameters.values())
+    if "renderer" in raw:
+        renderer = read_table(RendererTable, raw["renderer"], "renderer")
+        if renderer.delay == 0:  # however it is written, the study is the one without the key
+            renderer = msgspec.structs.replace(renderer, delay=NO_DELAY)
+        tables["renderer"] = renderer
+    if "constraints" in raw:
+        tables["constraints"] = _constraints(raw["constraints"])
+    materials = check_table(raw.get("materials", {}), "materials")
+    for name, table in materials.items():
+        check_keys(table, f"materials.{name}", _OVERRIDES)
+        check_keys(table.get("parameters", {}), f"materials.{name}.parameters", tuple(raw["parameters"]))
+    return Tables(parameters=parameters, materials=dict(materials), **tables)
+
+
+def _constraints(raw: Any) -> tuple[ConstraintTable, ...]:
+    """[[constraints]], each called by its number from 1. Raises `InputError`."""
+    if not isinstance(raw, list):
+        raise InputError(f"constraints is {shown(raw)}; it must be tables; write each as [[constraints]].")
+    return tuple(read_table(ConstraintTable, table, f"constraints.{i}") for i, table in enumerate(raw, 1))
+
+
+def _check_complete(raw: Mapping[str, Any]) -> None:
+    """Refuse a file that lacks keys: all of them at once. Raises `InputError`."""
+    missing = [key for key in _REQUIRED if key not in raw]
+    kinds = TABLES | {"renderer": RendererTable}
+    missing += (key for name, kind in kinds.items() if name in raw for key in missing_keys(kind, raw[name], name))
+    for name, table in check_table(raw.get("parameters", {}), "parameters").items():
+        missing += missing_keys(_kind_of(table), _of_one_kind(table, f"parameters.{name}"), f"parameters.{name}")
+    rule = raw.get("aggregation", {}).get("rule", "bcm")  # one that is none is refused with its value
+    stated = {"theta" if key == "length" else key for key in raw.get("gp", {})}
+    fixed = rule not in LEARN and rule in get_args(Rule)
+    unstated = [f"gp.{key}" for key in _LEARNT if fixed and key not in stated]
+    hint = f'; rule = "{LEARN[-1]}" in [aggregation] learns what [gp] does not state' if unstated else ""
+    check_present([*missing, *unstated], hint)
+
+
+def _kind_of(table: Any) -> type[ParameterTable | LevelsTable]:
+    """The schema of a parameter: of numbers, or of levels."""
+    return LevelsTable if isinstance(table, Mapping) and "levels" in table else ParameterTable
+
+
+def _of_one_kind(table: Any, path: str) -> Any:
+    """The parsed table of a parameter. Raises `InputError` for levels beside what only numbers have."""
+    if _kind_of(table) is LevelsTable:
+        beside = next((key for key in table if key in _NUMBERS_KEYS), None)
+        if beside is not None:
+            raise InputError(f"{path}.{beside} stands beside levels, which have no order and no unit; leave it out.")
+    elif isinstance(table, Mapping) and "correlation" in table:
+        raise InputError(f"{path}.correlation is of levels, and there are none; leave it out, or give levels.")
+    return table
+
+
+def _with_theta(table: GPTable, parameters: Collection[ParameterTable | LevelsTable]) -> GPTable:
+    """The same model with its lengths as theta: how they are written is not part of a study's hash. Levels have none,
+    but a correlation."""
+    dim = sum(isinstance(p, ParameterTable) for p in parameters)
+    for name, values in (("theta", table.theta), ("length", table.length)):
+        if isinstance(values, tuple) and len(values) != dim:
+            count, which = len(values), "" if dim == len(parameters) else " without levels"
+            raise InputError(
+                f"gp.{name} has {count} numbers; it must be one number or {dim}, one per parameter{which}."
+            )
+    if table.length is None:
+        return table
+    if table.theta is not None:
+        raise InputError(
+            "gp.length stands beside theta, which says the same (theta = 1/(2 length^2)); keep one of them."
+        )
+    each = table.length if isinstance(table.length, tuple) else (table.length,)
+    theta = tuple(1 / (2 * length**2) for length in each)
+    return msgspec.structs.replace(table, theta=theta if isinstance(table.length, tuple) else theta[0], length=None)
+
+
+def box_of(tables: Tables) -> Box:
+    """[parameters] and [renderer]. Raises `InputError`."""
+    parameters = tuple(_parameter(name, table) for name, table in tables.parameters.items())
+    constraints = tuple(Constraint(tuple(c.terms.items()), c.least, c.most) for c in tables.constraints)
+    if tables.renderer is None:
+        return Box(parameters, None, constraints)
+    for p in parameters:
+        unit = p.unit.replace("·", ".").replace("α", "alpha")
+        if p.name in _UNITS and unit not in ("", _UNITS[p.name]):
+            raise InputError(
+                f'parameters.{p.name}.unit is "{p.unit}"; it must be "{_UNITS[p.name]}" where there is a [renderer].'
+            )
+    renderer = msgspec.structs.asdict(tables.renderer)
+    del renderer["model"]
+    return Box(parameters, Mechanics(**renderer), constraints)
+
+
+def _parameter(name: str, table: ParameterTable | LevelsTable) -> Parameter:
+    if isinstance(table, LevelsTable):
+        return Parameter.of_levels(name, table.levels, table.correlation)
+    return Parameter(name, **msgspec.structs.asdict(table))
+
+
+def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
+    """Refuse tables that do not fit each other, or the parameters. Raises `InputError`."""
+    labels, selection = tables.study.responses, tables.selection
+    if len(set(labels)) < len(labels):
+        raise InputError(f"study.responses is {shown(labels)}; it must not have one label twice.")
+    if selection.space_filling > selection.trials:
+        raise InputError(
+            f"selection.space_filling is {selection.space_filling}; it must be at most trials = {selection.trials}."
+        )
+    rendered = tables.renderer is not None
+    reserved = next((p.name for p in parameters if is_reserved(p.name, labels, rendered)), None)
+    if reserved is not None:
+        raise InputError(
+            f"parameters.{reserved}: tables have a column {reserved} already; call the parameter otherwise, for example"
+            f" {reserved}_1."
+        )
+    tables.session.check(labels)
+    if tables.stimulus is not None:
+        tables.stimulus.check(parameters)
+        if tables.renderer is not None:
+            raise InputError("stimulus stands beside renderer, a study has one: a program presents, or a device.")
+    if tables.simulation is not None:
+        tables.simulation.check(parameters, len(labels))
+    _check_gp(tables.gp, tables.aggregation.rule, len(labels))
+    column = "" if tables.random_effect is None else tables.random_effect.column
+    if column in TRIAL_COLUMNS or column in {p.name for p in parameters} or column.startswith("_"):
+        raise InputError(
+            f'random_effect.column is "{column}", which has a meaning of its own; name another column of the'
+            " answers' table, such as the clip or the day."
+        )
+
+
+def _check_gp(table: GPTable, rule: Rule, count: int) -> None:
+    """For `count` responses."""
+    thresholds = table.thresholds
+    if thresholds is not None:
+        if len(thresholds) != count - 1:
+            raise InputError(
+                f"gp.thresholds is {shown(thresholds)}; it must have one number fewer than the {count} responses."
+            )
+        if any(low >= high for low, high in itertools.pairwise(thresholds)):
+            raise InputError(f"gp.thresholds is {shown(thresholds)}; it must rise from each number to the next.")
+    if rule in LEARN and table.inference != "laplace":
+        raise InputError(f'gp.inference is {shown(table.inference)}; it must be "laplace" with rule = "{rule}".')
+
+
+def of_material(raw: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """The parsed file as it is for one material."""
+    tables = {key: value for key, value in raw.items() if key != "materials"}
+    for table, changes in raw["materials"][name].items():
+        tables[table] = _merged(tables.get(table, {}), changes)
+    return tables
+
+
+def _merged(base: Any, changes: Any) -> Any:
+    """Changes over what they change, table within table."""
+    if not (isinstance(base, Mapping) and isinstance(changes, Mapping)):
+        return changes
+    return {**base, **{key: _merged(base.get(key, {}), value) for key, value in changes.items()}}

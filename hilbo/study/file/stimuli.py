@@ -1,0 +1,97 @@
+"""[stimulus]: what a study asks of the program, or the person, that presents its renderings, where no device of ours
+does."""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.search.box import Parameter
+from hilbo.study.file.fields import Table, shown, words
+
+__all__ = ["StimulusTable"]
+
+_EXACT = 1e-6  # of a parameter's range, or of the value on a logarithmic scale: more than 32 bits are off by
+_PATIENCE = {"within": 5.0, "silence": 3.0}  # s that a person who presents needs at least, and a tablet that slumbers
+_Seconds = Annotated[float, msgspec.Meta(ge=0.1, le=600), words("a number of seconds from 0.1 to 600", "1.0")]
+
+
+class StimulusTable(Table, frozen=True):
+    """`within`: s from an order until it is confirmed that it is presented. `silence`: s without a word from the
+    program until it counts as gone. `tolerance`: parameter -> how far the confirmed value may be off, in physical
+    units, on a logarithmic scale as a share of the value; a millionth of the range, or of the value, where nothing is
+    said. `unblinded`: who takes part is presented to by their own page, which knows the parameters; answers to any
+    other study that were given so are not aggregated with others'. `by`: whether a program presents, or a person by
+    hand, from the preparer's page. `experimenter_sees`: whether the experimenter is shown the parameters; if nothing is
+    said they are, but where a person presents."""
+
+    within: _Seconds = 1.0
+    silence: _Seconds = 1.0
+    tolerance: Annotated[dict[str, float], words("a table of numbers, 0 or above", "{height_px = 0.5}")] = (
+        msgspec.field(default_factory=dict)
+    )
+    unblinded: Annotated[bool, words("true or false", "false")] = False
+    by: Annotated[Literal["program", "person"], words('"program" or "person"', '"program"')] = "program"
+    experimenter_sees: Annotated[bool | None, words("true or false", "true")] = None
+
+    def check(self, parameters: Sequence[Parameter]) -> None:
+        """Refuse tolerances of what is no parameter, and those that are none. Raises `InputError`."""
+        names, levels = [p.name for p in parameters], [p.name for p in parameters if p.levels]
+        for name, value in self.tolerance.items():
+            path = f"stimulus.tolerance.{name}"
+            if name not in names:
+                raise InputError(f"{path} is of no parameter of the study, those are {', '.join(names)}.")
+            if name in levels:
+                raise InputError(f"{path} is of levels, and another level is none that was asked for; leave it out.")
+            if not 0 <= value < math.inf:
+                raise InputError(f"{path} is {shown(value)}; it must be a number, 0 or above.")
+        for key, least in _PATIENCE.items() if self.by == "person" else ():
+            if getattr(self, key) < least:
+                raise InputError(
+                    f"stimulus.{key} is {getattr(self, key):g} s, and a person presents; give them {least:g} s or more."
+                )
+
+    @property
+    def role(self) -> Literal["stimulus", "preparer"]:
+        """Who presents, as a role of a session."""
+        return "stimulus" if self.by == "program" else "preparer"
+
+    @property
+    def shown_to(self) -> tuple[str, ...]:
+        """The roles that are shown parameters."""
+        sees = self.by == "program" if self.experimenter_sees is None else self.experimenter_sees
+        return (self.role, "experimenter") if sees else (self.role,)
+
+    def check_shares(self, parameters: Sequence[Parameter]) -> None:
+        """Refuse tolerances that are no shares, where shares are wanted; in earlier versions they were in the unit, and
+        sessions of those are still read. Raises `InputError`."""
+        for p in parameters:
+            share = self.tolerance_of(p)
+            if p.scale == "log" and share >= 1:
+                raise InputError(
+                    f"stimulus.tolerance.{p.name} is {shown(share)}; on a logarithmic scale it is a share of the value"
+                    " and must be below 1, such as 0.01."
+                )
+
+    def tolerance_of(self, parameter: Parameter) -> float:
+        """How far a confirmed value may be off: in the parameter's unit, on a logarithmic scale as a share of it."""
+        if parameter.levels:
+            return 0.0
+        exact = _EXACT if parameter.scale == "log" else _EXACT * (parameter.high - parameter.low)
+        return self.tolerance.get(parameter.name, exact)
+
+    def off_by(self, parameter: Parameter, wanted: float) -> float:
+        """How far the confirmation of a value may be off, in the parameter's unit."""
+        return self.tolerance_of(parameter) * (wanted if parameter.scale == "log" else 1.0)
+
+    def off_by_before(self, parameter: Parameter) -> float:
+        """The same in sessions whose header has a schema below 3: on every scale in the unit, as of a linear one."""
+        return self.tolerance.get(parameter.name, _EXACT * (parameter.high - parameter.low))
+
+    def tolerance_words(self, parameter: Parameter) -> str:
+        """`tolerance_of` in words, such as 0.5 deg, or 1 %."""
+        if parameter.scale == "log":
+            return f"{100 * self.tolerance_of(parameter):.3g} %"
+        return f"{self.tolerance_of(parameter):.3g} {parameter.unit}".rstrip()

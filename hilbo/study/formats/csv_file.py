@@ -1,0 +1,245 @@
+"""Cells of a table, CSV or Parquet, as text; and columns of them as numbers.
+
+A number means what its decimals say (correctly rounded). A CSV table has commas, or, as spreadsheets of many countries
+write it, semicolons; then a comma in a number is the decimal point, and a warning says so. A table is read piece by
+piece. Whatever is wrong is one sentence with the file and the line (Parquet: row).
+"""
+
+import csv
+import math
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from hilbo.errors import InputError
+from hilbo.search.box import Parameter
+from hilbo.study.formats.cell_text import csv_rows, is_decimal, say_delimiter, without_decimal_comma
+
+__all__ = [
+    "FRAME",
+    "answer_forms",
+    "cell_pieces",
+    "cells_of",
+    "numbers",
+    "parameter_values",
+    "place",
+    "read_cells",
+    "refuse",
+]
+
+FRAME = "DataFrame"
+"""What a table that is in memory is called in sentences."""
+
+_PIECE = 50_000  # rows
+_SPREADSHEETS = (".xlsx", ".xls", ".ods")
+_SPREADSHEET = "is a spreadsheet; save it as CSV, by the spreadsheet's own menu"
+
+
+def read_cells(path: str | os.PathLike, needs: str = "a trial table needs a header and an answer") -> pd.DataFrame:
+    """Every cell as text, so that nothing is guessed; the index is the line (CSV) or the row (Parquet).
+
+    Raises `InputError` for what is no table; `needs` is said of an empty file.
+    """
+    return pd.concat(cell_pieces(path, needs))
+
+
+def cell_pieces(
+    path: str | os.PathLike, needs: str = "a trial table needs a header and an answer"
+) -> Iterator[pd.DataFrame]:
+    """The cells of a table as text, some rows at a time; at least one piece, which may have none."""
+    source, path = str(path), Path(path)
+    if path.suffix.lower() in _SPREADSHEETS and path.is_file():
+        raise InputError(f"{source}: {_SPREADSHEET}.")
+    try:
+        for frame in _parquet_pieces(path) if path.suffix == ".parquet" else _csv_pieces(path, source, needs):
+            again = frame.columns[frame.columns.duplicated()]
+            if len(again):
+                raise InputError(f'{place(source)}column "{again[0]}" stands there twice; keep one of them.')
+            yield frame
+    except InputError:
+        raise
+    except OSError as error:
+        why = error.strerror or ("it is a stream, and no file" if "seekable" in str(error) else error)
+        raise InputError(f"{source}: cannot be read ({why}); check the path.") from error
+    except (ValueError, csv.Error) as error:  # pyarrow's errors, and text that is no UTF-8, are ValueErrors
+        raise InputError(f"{source}: {_unreadable(path, error)}.") from error
+
+
+def _unreadable(path: Path, error: Exception) -> str:
+    """Why a file is no table, and what to do."""
+    with path.open("rb") as file:
+        begin = file.read(4)
+    if begin == b"PK\x03\x04":
+        return _SPREADSHEET
+    if isinstance(error, UnicodeDecodeError):
+        kind = "is UTF-16 text" if begin[:2] in (b"\xff\xfe", b"\xfe\xff") else "is no UTF-8 text"
+        return f"{kind}; save the table as CSV with the encoding UTF-8"
+    if isinstance(error, csv.Error) and "unexpected end of data" in str(error):
+        return "has a quotation mark that nothing closes; remove it, or close it"
+    reason = str(error).strip().splitlines()[-1]
+    return f"is not a table that can be read ({reason}); save it as CSV or Parquet"
+
+
+def cells_of(frame: pd.DataFrame) -> pd.DataFrame:
+    """The cells of a table in memory as text, its rows counted from 1. Raises `InputError` for what is none."""
+    if not isinstance(frame, pd.DataFrame):
+        raise InputError(f"{FRAME}: this is a {type(frame).__name__}; give a pandas DataFrame.")
+    again = frame.columns[frame.columns.duplicated()]
+    if len(again):
+        raise InputError(f'{place(FRAME)}column "{again[0]}" stands there twice; keep one of them.')
+    return _as_text(frame, 1)
+
+
+def _parquet_pieces(path: Path) -> Iterator[pd.DataFrame]:
+    """The first piece is empty: a table without rows has columns too."""
+    from pyarrow.parquet import ParquetFile
+
+    with ParquetFile(path) as file:
+        first_row = 1
+        yield _as_text(file.schema_arrow.empty_table().to_pandas(), first_row)
+        for batch in file.iter_batches(_PIECE):
+            yield _as_text(batch.to_pandas(), first_row)
+            first_row += batch.num_rows
+
+
+def _as_text(frame: pd.DataFrame, first_row: int) -> pd.DataFrame:
+    columns = {i: _column_as_text(frame.iloc[:, i]) for i in range(frame.shape[1])}  # a name may stand there twice
+    index = np.arange(first_row, first_row + len(frame))
+    return pd.DataFrame(columns, index=index, dtype=object).set_axis(frame.columns, axis=1)
+
+
+def _column_as_text(column: pd.Series) -> list[str]:
+    """Each cell with the fewest digits that are this number in the column's own precision: 0.99 of a float32 column is
+    0.99, and no number above it."""
+    narrow = column.dtype.kind == "f" and getattr(column.dtype, "itemsize", 8) < 8  # a sparse dtype has no size
+    return ["" if v is None or v is pd.NA else str(v) for v in (column.to_numpy() if narrow else column.tolist())]
+
+
+def _csv_pieces(path: Path, source: str, needs: str) -> Iterator[pd.DataFrame]:
+    """By Python's csv module: it knows the line of a row, and a row that is too long is no reason to guess."""
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        reader, delimiter = csv_rows(file, source)
+        say_delimiter(delimiter, source)
+        rows, lines, header, line, pieces = [], [], [], 1, 0
+        for row in reader:
+            if any(row):  # not an empty line, nor a spreadsheet's row of commas
+                header = header or row
+                if len(row) != len(header):
+                    raise InputError(
+                        f"{source}:{line}: has {len(row)} cells, the header has {len(header)}; fix that line."
+                    )
+                rows.append(row)
+                lines.append(line)
+                if len(rows) > _PIECE:
+                    yield _piece(rows, lines, header, pieces, delimiter)
+                    rows, lines, pieces = [], [], pieces + 1
+            line = reader.line_num + 1
+        if not header:
+            raise InputError(f"{source}: is empty; {needs}.")
+        if rows:
+            yield _piece(rows, lines, header, pieces, delimiter)
+
+
+def _piece(rows: list[list[str]], lines: list[int], header: list[str], pieces: int, delimiter: str) -> pd.DataFrame:
+    skip = 0 if pieces else 1  # the first row of the first piece is the header
+    frame = pd.DataFrame(rows[skip:], index=lines[skip:], columns=header, dtype=object)
+    frame.attrs["decimal comma"] = delimiter != ","
+    return frame
+
+
+def place(source: str, row: object = None) -> str:
+    """Where in a table: the line of a CSV file, the row of a Parquet file or of one in memory, or the heads of its
+    columns."""
+    if str(source).endswith(".parquet") or source == FRAME:
+        return f"{source}: " if row is None else f"{source}: row {row}: "
+    return f"{source}:{1 if row is None else row}: "
+
+
+def numbers(text: pd.DataFrame, column: str, source: str, words: str, valid) -> pd.Series:
+    """A column as float64, each cell correctly rounded; `valid` says which values may be, `words` which those are."""
+    cells = _with_points(text, column, source)
+    comma = text.attrs.get("decimal comma", False)
+    try:
+        floats = [] if "_" in "".join(cells) else [float(cell) for cell in cells]
+    except ValueError:
+        floats = []
+    values = pd.Series(floats if len(floats) == len(cells) else [_number(c) for c in cells], text.index, dtype=float)
+    wrong = ~(np.isfinite(values) & valid(values))
+    hint = "" if comma else "; write 1.5 for one and a half"
+
+    def sentence(row: object) -> str:
+        cell = text.at[row, column]
+        return f'{column} is "{cell}"; it must be {words}{hint if "," in cell else ""}.'
+
+    refuse(wrong, source, sentence)
+    return values
+
+
+def answer_forms(responses: Sequence[str]) -> tuple[dict[str, int], str]:
+    """How an answer may be written -> its category from 0, and the words for what else than a label may be written.
+
+    Labels are compared as text. Ranks from 1 are understood only if no label reads as a number: of a scale with the
+    labels "1.0", "1.5", "2.0" a rank would be another answer. Of one with whole numbers "6.0" is 6: so pandas writes a
+    column in which an answer is missing.
+    """
+    forms = {label: i for i, label in enumerate(responses)}
+    if all(re.fullmatch("0|-?[1-9][0-9]*", label) for label in responses):
+        return {form: i for label, i in forms.items() for form in (label, f"{label}.0", f"{label},0")}, ""
+    if any(math.isfinite(_number(without_decimal_comma(label))) for label in responses):
+        return forms, ""
+    ranks = {form: i for i in range(len(responses)) for form in (str(i + 1), f"{i + 1}.0", f"{i + 1},0")}
+    return ranks | forms, f"a rank from 1 to {len(responses)}"
+
+
+def parameter_values(text: pd.DataFrame, parameter: Parameter, source: str) -> pd.Series:
+    """A parameter's column in physical numbers, of levels, which stand there by their names, the places in the list.
+
+    Raises `InputError` for what is no number of the range, or none of the levels.
+    """
+    if parameter.levels:
+        cells = text[parameter.name].str.strip()
+        values = cells.map({level: float(place) for place, level in enumerate(parameter.levels)})
+        refuse(
+            values.isna(),
+            source,
+            lambda row: f'{parameter.name} is "{cells.at[row]}"; it must be {parameter.range_words}.',
+        )
+        return values.astype(float)
+
+    def valid(values):
+        return (values >= parameter.low) & (values <= parameter.high) & ((values % 1 == 0) | (not parameter.integer))
+
+    return numbers(text, parameter.name, source, f"{parameter.range_words}, the study's range", valid)
+
+
+def _with_points(text: pd.DataFrame, column: str, source: str) -> list[str]:
+    """The cells of a column, its numbers with a decimal point. Raises `InputError` for commas and points in one."""
+    cells = text[column].tolist()
+    if not text.attrs.get("decimal comma", False):
+        return cells
+    marks = {mark: next((i for i, cell in enumerate(cells) if is_decimal(cell, mark)), None) for mark in ",."}
+    if None not in marks.values():
+        rows = {mark: text.index[i] for mark, i in marks.items()}
+        raise InputError(
+            f"{place(source, max(rows.values()))}{column} has decimal commas and decimal points"
+            f' ("{text.at[rows[","], column]}" and "{text.at[rows["."], column]}"); write all with one of them.'
+        )
+    return [without_decimal_comma(cell) for cell in cells]
+
+
+def _number(cell: str) -> float:
+    try:
+        return np.nan if "_" in cell else float(cell)  # Python reads 1_5 as 15
+    except ValueError:
+        return np.nan
+
+
+def refuse(wrong: pd.Series, source: str, sentence: Callable[[object], str]) -> None:
+    """Raise `InputError` with `sentence(row)` for the first row that is wrong."""
+    if wrong.any():
+        row = wrong.idxmax()
+        raise InputError(f"{place(source, row)}{sentence(row)}")

@@ -1,0 +1,194 @@
+"""Validation tables, one row per comparison of two parameter sets, and sets tables, one row per set; read and checked.
+
+Validation: `participant, trial, set_a, set_b, class_a, class_b, preferred`, optional `material, session, first`; others
+are kept. `class_a`, `class_b` are labels of the study's responses (or ranks from 1, if no label reads as an integer),
+`preferred` and `first` one of the two sets, or "a" or "b"; `preferred` may be "tie". Rows whose `voided` is 1, or whose
+`phase` is warm-up or repeat, are left out. What was not asked is empty.
+Sets: `set_id, source` (aggregate, sysid or individual:PARTICIPANT), and the parameters that the caller names.
+Whatever is wrong is one sentence with the file and the line.
+"""
+
+import os
+from collections.abc import Collection, Sequence
+
+import pandas as pd
+
+from hilbo.errors import InputError
+from hilbo.search.box import Parameter
+from hilbo.study.formats.csv_file import answer_forms, numbers, read_cells, refuse
+from hilbo.study.tables.flag_counts import counted_flags, flagged, with_flag_counts
+from hilbo.study.tables.parameter_sets import read_sets
+from hilbo.study.tables.trials import check_people, check_texts, flags, is_fitted
+
+__all__ = ["NONE", "RESPONSES", "TIE", "check_validation", "of_material", "read_validation", "sets_frame"]
+
+RESPONSES = ("different", "similar", "close")
+TIE = "tie"
+NONE = ""
+"""What stands where nothing was asked."""
+
+_NEEDED = ("participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred")
+_OPTIONAL = ("material", "session", "first")
+_KEY = ("participant", "material", "session", "trial")
+_RESERVED = ("a", "b", TIE)
+
+
+def read_validation(
+    path: str | os.PathLike,
+    responses: Sequence[str] = RESPONSES,
+    material: str | None = None,
+    exclude_flags: Collection[str] = (),
+) -> pd.DataFrame:
+    """The comparisons of one material; `responses` are the study's, lowest first. Raises `InputError`.
+
+    Rows with one of `exclude_flags` are excluded.
+    All cells are text but `trial`; classes are labels, `preferred` and `first` names of sets (or "tie"), or empty.
+    """
+    text = read_cells(path, "a validation table needs a header and a comparison")
+    if "material" in text:
+        text["material"] = text["material"].str.strip()
+    return check_validation(of_material(text, material, str(path)), responses, str(path), exclude_flags)
+
+
+def check_validation(
+    table: pd.DataFrame,
+    responses: Sequence[str] = RESPONSES,
+    source: str = "validation table",
+    exclude_flags: Collection[str] = (),
+) -> pd.DataFrame:
+    """Check a table however it was made, and bring it into the form that `read_validation` gives.
+
+    Rows with one of `exclude_flags` are left out; the table carries their counts (`flag_counts.flag_counts`).
+    Raises `InputError` for a missing column, a table without rows, and values that cannot be.
+    """
+    _check_columns(table, source)
+    text = _as_text(table)
+    out = text.copy()
+    whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0) & (v < 2**53))
+    out["trial"] = whole.astype(int)
+    check_people(text, source)
+    check_texts(text, source, ("trial",))
+    _check_sets(text, source)
+    for column in ("class_a", "class_b"):
+        out[column] = _classes(text, column, responses, source)
+    out["preferred"] = _chosen(text, "preferred", (TIE,), source)
+    if "first" in text:
+        out["first"] = _chosen(text, "first", (), source)
+    nothing = (out["class_a"] == NONE) & (out["class_b"] == NONE) & (out["preferred"] == NONE)
+    refuse(nothing, source, lambda row: "holds no answer; fill in class_a and class_b, or preferred, or leave it out.")
+    _check_duplicates(out, source)
+    counts = ~flags(text, "voided", source) & (is_fitted(text["phase"]) if "phase" in text else True)
+    flags_of = counted_flags(out[counts], exclude_flags)
+    counts &= ~flagged(out, exclude_flags)
+    if not counts.any():
+        besides = ", or excluded by `exclude_flags`" if exclude_flags else ""
+        raise InputError(f"{source}: has no comparison that counts; all are warm-up, repeated or voided{besides}.")
+    return with_flag_counts(out[counts], flags_of)
+
+
+def _check_columns(table: pd.DataFrame, source: str) -> None:
+    """Refuse a table that lacks a column, or has no rows."""
+    missing = [name for name in _NEEDED if name not in table.columns]
+    if missing:
+        raise InputError(
+            f'{source}:1: column "{missing[0]}" is missing; a validation table has {", ".join(_NEEDED)}'
+            f" and may have {', '.join(_OPTIONAL)}."
+        )
+    if table.empty:
+        raise InputError(f"{source}: has no rows; a validation table needs at least one comparison.")
+
+
+def _as_text(table: pd.DataFrame) -> pd.DataFrame:
+    """The table with its own columns as text without blanks around it, empty where nothing is."""
+    text = table.copy()
+    for column in (*_NEEDED, *(name for name in (*_OPTIONAL, "voided", "phase") if name in text)):
+        cells = ["" if pd.isna(cell) else str(cell).strip() for cell in text[column]]
+        text[column] = ["" if cell == "nan" else cell for cell in cells]  # a column of nothing, read from Parquet
+    return text
+
+
+def _check_sets(text: pd.DataFrame, source: str) -> None:
+    """Refuse comparisons of anything but two sets with names of their own."""
+    for column in ("set_a", "set_b"):
+        refuse(text[column] == "", source, lambda row, c=column: f"{c} is empty; every comparison has one.")
+    for column in ("set_a", "set_b"):
+        refuse(
+            text[column].isin(_RESERVED),
+            source,
+            lambda row, c=column: (
+                f'{c} is "{text.at[row, c]}", which has a meaning of its own; name the set otherwise.'
+            ),
+        )
+    same = text["set_a"] == text["set_b"]
+    refuse(same, source, lambda row: f'set_a and set_b are both "{text.at[row, "set_a"]}"; compare two sets.')
+
+
+def of_material(table: pd.DataFrame, material: str | None, source: str = "validation table") -> pd.DataFrame:
+    """The rows of one material, which must be named if there are several.
+
+    Raises `InputError` if it is not said, or is not there.
+    """
+    materials = list(table["material"].unique()) if "material" in table else []
+    if material is None:
+        if len(materials) > 1:
+            raise InputError(
+                f"{source}: holds {len(materials)} materials ({', '.join(materials)}); choose one of them."
+            )
+        return table
+    if material not in materials:
+        has = f"it has {', '.join(materials)}" if materials else 'it has no column "material"'
+        raise InputError(f'{source}: holds no comparisons of material "{material}"; {has}.')
+    return table[table["material"] == material]
+
+
+def sets_frame(
+    path: str | os.PathLike, names: Sequence[str] = (), parameters: Sequence[Parameter] = ()
+) -> pd.DataFrame:
+    """A sets table (`parameter_sets.read_sets`) whose sets say where they are from, indexed by `set_id`. `names`:
+    columns of numbers; `parameters`: those among them that may be levels, whose names become their places in the
+    list."""
+    chosen = [p for p in parameters if p.levels]
+    sets = read_sets(path, ("source", *names), {p.name: p.levels for p in chosen})
+    frame = pd.DataFrame.from_dict(sets, orient="index").rename_axis("set_id")
+    for p in chosen:
+        frame[p.name] = [p.number(value) for value in frame[p.name]]
+    text = frame.select_dtypes(exclude="number").columns
+    return frame.fillna(dict.fromkeys(text, ""))
+
+
+def _classes(text: pd.DataFrame, column: str, responses: Sequence[str], source: str) -> pd.Series:
+    """Labels of the responses, from labels or ranks; `NONE` where nothing was asked."""
+    forms, ranks = answer_forms(responses)
+    labels = text[column].map({form: responses[i] for form, i in forms.items()} | {"": NONE})
+    allowed = ", ".join(responses) + (ranks and f", {ranks}") + ", or empty"
+    refuse(labels.isna(), source, lambda row: f'{column} is "{text.at[row, column]}"; it must be one of {allowed}.')
+    return labels
+
+
+def _chosen(text: pd.DataFrame, column: str, others: tuple[str, ...], source: str) -> pd.Series:
+    """One of the two sets by its name or as "a" or "b", or one of `others`."""
+    cells = text[column].mask(text[column] == "a", text["set_a"]).mask(text[column] == "b", text["set_b"])
+    good = (cells == text["set_a"]) | (cells == text["set_b"]) | cells.isin((NONE, *others))
+    allowed = "".join(f", {other}" for other in others)
+    refuse(
+        ~good,
+        source,
+        lambda row: (
+            f'{column} is "{text.at[row, column]}"; it must be {text.at[row, "set_a"]}, {text.at[row, "set_b"]}'
+            f"{allowed}, or empty."
+        ),
+    )
+    return cells
+
+
+def _check_duplicates(table: pd.DataFrame, source: str) -> None:
+    key = [column for column in _KEY if column in table]
+    again = table.duplicated(key)
+    refuse(
+        again,
+        source,
+        lambda row: (
+            f"participant {table.at[row, 'participant']}, trial {table.at[row, 'trial']} stands there already;"
+            f" each ({', '.join(key)}) may occur once."
+        ),
+    )
