@@ -22,7 +22,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 CORE = ROOT / "firmware" / "core"
 FILES = ("hb_motion.c", "hb_requests.c", "hb_device.c", "hb_staging.c", "hb_safety.c", "hb_drive.c", "hb_delay.c")
-TESTS = ("protocol", "orders", "safety", "telemetry", "sets", "contact", "switching")
+TESTS = ("edges", "protocol", "orders", "safety", "telemetry", "sets", "contact", "switching")
 SWAPS = {
     "<=": "<", ">=": ">", "==": "!=", "!=": "==", "&&": "||", "||": "&&", " < ": " <= ", " > ": " >= ",
     " + ": " - ", " - ": " + ", " * ": " / ", " += ": " -= ", " -= ": " += ",
