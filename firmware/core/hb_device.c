@@ -160,10 +160,12 @@ static bool is_late(const struct hb_device *device, const struct hb_input *input
 /* A device that moves by itself meets its stops with nobody's hand between. */
 static float fastest(const struct hb_device *device)
 {
-    const struct hb_config *config = device->config;
-    float driven_mm_per_s = HB_DRIVEN_SPEED * config->servo_speed_mm_per_s;
-    bool slower = hb_is_in(device, HB_DRIVING) && driven_mm_per_s < config->velocity_limit_mm_per_s;
-    return slower ? driven_mm_per_s : config->velocity_limit_mm_per_s;
+    float limit_mm_per_s = device->config->velocity_limit_mm_per_s;
+    if (hb_is_in(device, HB_DRIVING)) {
+        float driven_mm_per_s = HB_DRIVEN_SPEED * device->config->servo_speed_mm_per_s;
+        limit_mm_per_s = driven_mm_per_s < limit_mm_per_s ? driven_mm_per_s : limit_mm_per_s;
+    }
+    return limit_mm_per_s;
 }
 
 static enum hb_cause fault(const struct hb_device *device, bool input_lost, bool late, bool hot, bool finite)
@@ -219,15 +221,26 @@ static float command(struct hb_device *device, float wanted_N, enum hb_cause cau
     return 0.0F;
 }
 
+static uint32_t flag_of_state(uint8_t state)
+{
+    switch (state) {
+    case HB_RUNNING:
+        return (uint32_t)HB_FLAG_RUNNING;
+    case HB_DRIVING:
+        return (uint32_t)HB_FLAG_DRIVING;
+    case HB_HOLDING:
+        return (uint32_t)HB_FLAG_HOLD;
+    case HB_ESTOPPED:
+        return (uint32_t)HB_FLAG_ESTOP;
+    default:
+        return 0U;
+    }
+}
+
 static uint16_t state_flags(const struct hb_device *device)
 {
-    uint32_t flags = device->safety.flags;
-    flags |= hb_in_contact(&device->safety) ? (uint32_t)HB_FLAG_CONTACT : 0U;
-    flags |= hb_is_in(device, HB_HOLDING) ? (uint32_t)HB_FLAG_HOLD : 0U;
-    flags |= hb_is_in(device, HB_ESTOPPED) ? (uint32_t)HB_FLAG_ESTOP : 0U;
-    flags |= hb_is_in(device, HB_RUNNING) ? (uint32_t)HB_FLAG_RUNNING : 0U;
-    flags |= hb_is_in(device, HB_DRIVING) ? (uint32_t)HB_FLAG_DRIVING : 0U;
-    return (uint16_t)flags;
+    uint32_t contact = hb_in_contact(&device->safety) ? (uint32_t)HB_FLAG_CONTACT : 0U;
+    return (uint16_t)(device->safety.flags | contact | flag_of_state(device->state));
 }
 
 float hb_tick(struct hb_device *device, const struct hb_input *input)
@@ -247,10 +260,11 @@ float hb_tick(struct hb_device *device, const struct hb_input *input)
     if (late) {
         hb_count_up(&safety->count.overruns);
     }
-    bool opens = input->stop_open && !device->stop_open;
-    device->stop_open = input->stop_open;
-    if (opens) {
-        hb_estop(device, HB_CAUSE_SWITCH);
+    if (input->stop_open != device->stop_open) {
+        device->stop_open = input->stop_open;
+        if (input->stop_open) {
+            hb_estop(device, HB_CAUSE_SWITCH);
+        }
     }
     bool hot = hb_is_too_hot(safety, config);
     bool input_lost = !hb_check_input(safety, config, input);
