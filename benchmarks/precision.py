@@ -154,7 +154,6 @@ def choices() -> Iterator[Row]:
         "UCB": acquisition.UCB(0.7),
         "LogEI": acquisition.LogEI(jnp.asarray(0.9)),
         "TopCategory": acquisition.TopCategory(0.5, 0.5),
-        "Mean": acquisition.Mean(),
     }
     by_dtype = []
     for dtype in TYPES:

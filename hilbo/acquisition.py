@@ -6,7 +6,6 @@ and is then polished by Newton's method in the optimiser's coordinates, in which
     UCB (paper, section IV-3):   mu + weight * sigma
     log expected improvement:    log( sigma * h((mu - best) / sigma) ),  h(z) = phi(z) + z Phi(z)
     top category:                log P(highest answer) = log Phi((mu - t) / sqrt(noise^2 + sigma^2))
-    mean:                        mu
     Thompson:                    the maximum of one draw of f over the candidates
 
 Log expected improvement after Ament et al. (2023), arXiv:2310.20708: without the logarithm it is 0, and flat, wherever
@@ -25,7 +24,7 @@ from hilbo.numerics.climbing import Choice, climb, spread
 from hilbo.numerics.linalg import eigh
 from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
 
-__all__ = ["UCB", "LogEI", "Mean", "Score", "TopCategory", "maximise", "thompson"]
+__all__ = ["UCB", "LogEI", "Score", "TopCategory", "maximise", "thompson"]
 
 
 def __dir__() -> list[str]:
@@ -81,19 +80,6 @@ class TopCategory(eqx.Module):
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
         """Certain where the mean is above the threshold, as uncertain as the prior below it."""
         return self(mean, jnp.where(mean > self.threshold.astype(mean.dtype), 0.0, prior))
-
-
-class Mean(eqx.Module):
-    """The posterior mean itself: pure exploitation, and what the final optimum maximises."""
-
-    def __call__(self, mean, variance):
-        del variance
-        return mean
-
-    def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
-        """The mean (...), whatever the variance."""
-        del prior
-        return mean
 
 
 def _log_improvement(z: Float[Array, "*m"]) -> Float[Array, "*m"]:

@@ -17,7 +17,7 @@ __all__ = ["aggregate", "aggregate_cohort", "read_cohort", "robustness"]
 # What draws and writes, loaded beside the arithmetic. Packages that the arithmetic never imports, because two threads
 # that import one package at once may see half of it.
 _DRAW_AND_WRITE = ("matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2")
-_SUMS = ("bcm", "rbcm", "average")  # sums over people, at each point for itself
+_SUMS = ("bcm", "average")  # sums over people, at each point for itself
 _LARGE = 1000  # participants: above, posteriors are not kept, and what costs a fit of everybody is left out
 
 StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
@@ -38,7 +38,7 @@ def aggregate(
     rule: Annotated[
         str | None,
         typer.Option(
-            help="Rule of aggregation in place of the study file's: bcm, rbcm, hierarchical, average, pooled, or"
+            help="Rule of aggregation in place of the study file's: bcm, hierarchical, average, pooled, or"
             " learnt-1 and learnt-2, which learn [gp] too."
         ),
     ] = None,

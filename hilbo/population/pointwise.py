@@ -3,12 +3,11 @@
 At a point with prior variance k let person j's posterior have mean m_j and variance k - e_j, e_j >= 0 being what the
 answers explain. Every rule but the average is one precision-weighted sum over people,
 
-    1 / v = 1 / p k + sum_j b_j e_j / (k (k - p e_j)),      mean = v sum_j b_j m_j / (k - p e_j),
+    1 / v = 1 / p k + sum_j e_j / (k (k - p e_j)),      mean = v sum_j m_j / (k - p e_j),
 
-    rule          p        b_j
-    bcm           1        1
-    hierarchical  share    1
-    rbcm          1        log(k / (k - e_j)) / 2
+    rule          p
+    bcm           1
+    hierarchical  share
 
 in which a person without answers has e_j = 0 and m_j = 0 and adds nothing. `hierarchical` is the model f_j = g + h_j,
 cov(g) = p k, cov(h_j) = (1 - p) k, point by point: of e_j's precision only a part is about g, since the person's own
@@ -16,8 +15,8 @@ h_j is noise to it. p = 1 is the Bayesian committee machine, which says that peo
 plain mean of the latents, in which everybody counts the same.
 
 The sums may be made at once (`aggregate`), or of blocks of people that are added up (`hilbo.study.estimate.batch`).
-References: Tresp (2000) bcm; Deisenroth & Ng (2015) rbcm. Products of experts and grbcm were measured beside these and
-won nowhere (docs/methods/aggregation.md).
+Reference: Tresp (2000). Products of experts, rbcm and grbcm were measured beside these and won nowhere
+(docs/methods/aggregation.md).
 """
 
 import functools
@@ -33,7 +32,7 @@ from hilbo.numerics.tracing import traced_once
 
 __all__ = ["RULES", "Rule", "Sums", "aggregate", "terms"]
 
-Rule = Literal["bcm", "hierarchical", "rbcm", "average"]
+Rule = Literal["bcm", "hierarchical", "average"]
 RULES: tuple[Rule, ...] = get_args(Rule)
 
 
@@ -58,15 +57,14 @@ class Sums(NamedTuple):
 
 
 def terms(
-    rule: Rule, means: Float[Array, "*s"], explained: Float[Array, "*s"], prior: Float[Array, "..."], share: ArrayLike
+    means: Float[Array, "*s"], explained: Float[Array, "*s"], prior: Float[Array, "..."], share: ArrayLike
 ) -> Sums:
-    """What each person adds to the sums of a rule; `share`: p, a scalar, 1 for every rule but the hierarchical one.
+    """What each person adds to the sums; `share`: p, a scalar, 1 for every rule but the hierarchical one.
 
     `means` and `explained` of any shape, and the sums of the same.
     """
     remaining = prior - share * explained
-    weight = -0.5 * jnp.log1p(-explained / prior) if rule == "rbcm" else jnp.ones_like(means)
-    return Sums(weight * explained / (prior * remaining), weight * means / remaining, means, explained)
+    return Sums(explained / (prior * remaining), means / remaining, means, explained)
 
 
 def aggregate(
@@ -114,7 +112,7 @@ def _aggregated(
     if rule == "average":
         return bcm.average(means, prior[None, :] - explained, mask=mask)
     common_share = jnp.ones((), means.dtype) if share is None else share
-    each = terms(rule, means, explained, prior[None, :], common_share)
+    each = terms(means, explained, prior[None, :], common_share)
     present = jnp.ones(means.shape[0], bool) if mask is None else mask
     sums = Sums(*(jnp.sum(jnp.where(present[:, None], leaf, 0.0), axis=0) for leaf in each))
     return sums.merge(prior, jnp.sum(present, dtype=means.dtype), rule, common_share)

@@ -28,7 +28,6 @@ _ESTIMATES = {
     "learnt-2": "people who differ, hyperparameters learnt (learnt-2)",
     "mean_of_optima": "mean of the individual optima",
     "pooled": "one model of all answers",
-    "rbcm": "robust committee machine (rbcm)",
 }
 _SHOWN = 200  # participants in the page's table
 

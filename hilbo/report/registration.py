@@ -22,7 +22,6 @@ _ACQUISITIONS = {
 }
 _RULES = {
     "bcm": "the Bayesian committee machine",
-    "rbcm": "the robust Bayesian committee machine",
     "hierarchical": "the hierarchical model, with a learnt share that people have in common",
     "average": "the plain average of people's latent functions",
     "pooled": "one function fitted to all answers",

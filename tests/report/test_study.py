@@ -1,6 +1,5 @@
 """`hilbo report`: what it says of poor data and of the hypotheses, its tables, its figures and its page."""
 
-import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -63,8 +62,6 @@ def test_limits_are_named():
     assert limits_of(study, crowd([HILL]))[0].startswith(
         "P0 is the only participant: the population map is that person's own,"
     )
-    shrunk = limits_of(dataclasses.replace(study, rule="rbcm"), crowd([HILL]))[0]
-    assert "own, shrunk towards the prior, and nothing" in shrunk
 
 
 def test_halves_share_nobody_and_people_are_held_against_the_half_without_them():

@@ -23,7 +23,7 @@ SPACES = {
     ),
     "plane": SearchSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0))),
 }
-SCORES = [acquisition.UCB(0.7), acquisition.LogEI(0.3), acquisition.TopCategory(0.5, 0.5), acquisition.Mean()]
+SCORES = [acquisition.UCB(0.7), acquisition.LogEI(0.3), acquisition.TopCategory(0.5, 0.5)]
 each_space = pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
 
 

@@ -12,12 +12,12 @@ from live import RAW
 from live import STUDY as SMALL
 
 from hilbo import Session, Study
-from hilbo.acquisition import UCB, LogEI, Mean, TopCategory
+from hilbo.acquisition import UCB, LogEI, TopCategory
 from hilbo.errors import InputError
 from hilbo.session.choose.ask_tell import physical_trials
 
 PAPER = "hilbo/data/paper.toml"
-DIFFERENTIABLE = ("top_category", "mean", "log_ei")
+DIFFERENTIABLE = ("top_category", "log_ei")
 deep = pytest.mark.deep
 
 
@@ -155,7 +155,6 @@ def test_other_acquisitions_choose_the_best_by_their_score(kind):
     posterior = session.posterior()
     score = {
         "top_category": TopCategory(small.gp.likelihood.thresholds[-1], small.gp.likelihood.noise),
-        "mean": Mean(),
         "log_ei": LogEI(posterior.mean(session.trials.x[:3]).max()),
     }[kind]
     chosen = np.asarray(small.space.to_unit(np.array([list(session.ask().values())])))

@@ -29,7 +29,7 @@ from hilbo.study.file.schema import Selection
 __all__ = ["Choosing", "Design", "design", "next_point", "point_after", "point_apart"]
 
 _STARTS = 4  # of the polishing, on the lattice
-_GAIN, _IN_UNITS_OF_F = 1e-7, ("ucb", "mean")  # of the prior's sd: less is no reason to polish on
+_GAIN = 1e-7  # of the prior's sd, of a score in units of f: less is no reason to polish on
 _JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in their number
 
 
@@ -122,7 +122,7 @@ def _highest(study, plan, posterior, score, allowed=None) -> Choice:
         return score(mean[0], variance[0])
 
     space = study.space.searched
-    if study.selection.acquisition in _IN_UNITS_OF_F:
+    if study.selection.acquisition == "ucb":
         space["gain"] = _GAIN * jnp.sqrt(study.gp.kernel.variance)
     short = posterior.astype(jnp.float32)
     fitted = short.gp.kernel, short.trials.x, short.latent.weights, short.latent.factor
@@ -146,9 +146,7 @@ def _score(study, posterior, weight):
     if kind == "log_ei":
         trials = posterior.trials
         return acquisition.LogEI(jnp.max(jnp.where(trials.mask, posterior.mean(trials.x), -jnp.inf)))
-    if kind == "top_category":
-        return acquisition.TopCategory(study.gp.likelihood.thresholds[-1], study.gp.likelihood.noise)
-    return acquisition.Mean()
+    return acquisition.TopCategory(study.gp.likelihood.thresholds[-1], study.gp.likelihood.noise)
 
 
 def _searched(plan: Design, count: int | None) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:

@@ -115,10 +115,9 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
     """What these answers cannot say, in sentences."""
     counts, sentences = cohort.counts(), []
     if len(cohort.names) == 1:
-        map_ = "is that person's own, shrunk towards the prior" if study.rule == "rbcm" else "is that person's own"
         sentences.append(
-            f"{cohort.names[0]} is the only participant: the population map {map_}, and nothing is known of how people"
-            " differ."
+            f"{cohort.names[0]} is the only participant: the population map is that person's own, and nothing is known"
+            " of how people differ."
         )
     few = [name for name, count in zip(cohort.names, counts, strict=True) if count < 5]
     if few:

@@ -15,7 +15,7 @@ from hilbo.study.estimate.optimum import predict_map
 
 __all__ = ["ALIKE", "SURE", "heterogeneity", "in_place", "rule_warnings", "share_content"]
 
-ALIKE = ("bcm", "rbcm", "pooled")  # rules that take people to share one function
+ALIKE = ("bcm", "pooled")  # rules that take people to share one function
 SURE = 3.0  # log Bayes factor, about 20 to 1
 _TOO_SURE = 1.5  # times as large as the map says: a standard deviation worth a sentence
 

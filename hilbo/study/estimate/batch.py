@@ -280,10 +280,10 @@ def _sum_of_block(of_person: Callable, people: PyTree, platform: str) -> PyTree:
 
 def _person_sums(predictor: _Predictor, points: Float[Array, "m d"], by: tuple[Rule, float]) -> Sums:
     """What one person adds to the sums of a rule at the points."""
-    rule, share = by
+    _, share = by
     cross = gram(predictor.kernel, predictor.x, points)
     means, explained = mean_and_explained(predictor.weights, predictor.factor, predictor.inverse, cross)
-    return terms(rule, means, explained, jax.vmap(predictor.kernel.diagonal)(points), share)
+    return terms(means, explained, jax.vmap(predictor.kernel.diagonal)(points), share)
 
 
 def _person_jets(predictor: _Predictor, points: Float[Array, "s d"], by: tuple[Rule, float]) -> Jets:

@@ -14,6 +14,7 @@ from hilbo.population.learnt.rule import Learnt, learn
 from hilbo.population.maps import ALL_RULES, RuleMap
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.file.schema import WITHDRAWN_RULES
 
 __all__ = ["by_rule", "effect_content", "learnt_content", "learnt_sentences", "resolved", "that_learns"]
 
@@ -32,6 +33,8 @@ def by_rule(study: Study, rule: str) -> Study:
     needs a [gp] where the study learns its own."""
     if rule == study.rule:
         return study
+    if rule in WITHDRAWN_RULES:
+        raise InputError(f"--rule is {WITHDRAWN_RULES[rule]}")
     if rule not in ALL_RULES:
         raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
     if rule in RECIPES:

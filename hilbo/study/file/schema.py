@@ -20,6 +20,7 @@ __all__ = [
     "LEARN",
     "NO_DELAY",
     "TABLES",
+    "WITHDRAWN_RULES",
     "ConstraintTable",
     "GPTable",
     "Inference",
@@ -33,11 +34,15 @@ __all__ = [
 ]
 
 Inference = Literal["laplace", "ep", "ep_corrected", "exact"]
-Rule = Literal["bcm", "hierarchical", "rbcm", "average", "pooled", "learnt-1", "learnt-2"]
+Rule = Literal["bcm", "hierarchical", "average", "pooled", "learnt-1", "learnt-2"]
 """How people are aggregated; `hilbo.population.maps` has the rules."""
 LEARN: tuple[Rule, ...] = ("learnt-1", "learnt-2")
 """The rules that learn what [gp] leaves out."""
-Acquisition = Literal["ucb", "log_ei", "thompson", "top_category", "mean"]
+WITHDRAWN_RULES = {
+    "rbcm": '"rbcm", which was withdrawn: it won no comparison; write "learnt-2" (recommended) or "bcm" (the paper\'s).'
+}
+"""Rules of earlier versions, whose names stay reserved: name -> what an error says after "rule is"."""
+Acquisition = Literal["ucb", "log_ei", "thompson", "top_category"]
 
 
 class StudyTable(_Table, frozen=True):

@@ -14,6 +14,7 @@ from hilbo.study.file.schema import (
     LEARN,
     NO_DELAY,
     TABLES,
+    WITHDRAWN_RULES,
     ConstraintTable,
     GPTable,
     LevelsTable,
@@ -74,6 +75,8 @@ def _check_complete(raw: Mapping[str, Any]) -> None:
     for name, table in check_table(raw.get("parameters", {}), "parameters").items():
         missing += missing_keys(_kind_of(table), _of_one_kind(table, f"parameters.{name}"), f"parameters.{name}")
     rule = raw.get("aggregation", {}).get("rule", "bcm")  # one that is none is refused with its value
+    if rule in WITHDRAWN_RULES:
+        raise InputError(f"aggregation.rule is {WITHDRAWN_RULES[rule]}")
     stated = {"theta" if key == "length" else key for key in raw.get("gp", {})}
     fixed = rule not in LEARN and rule in get_args(Rule)
     unstated = [f"gp.{key}" for key in _LEARNT if fixed and key not in stated]
