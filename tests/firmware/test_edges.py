@@ -50,7 +50,16 @@ def test_a_home_at_a_count_that_is_an_end_of_the_stroke_is_exact(end):
     before = device.stops
     device.must("HOME", boot_id=7, position_mm=end)
     device.run([0] * 3)
-    assert device.status()["position_mm"] == end and device.stops == before + 1
+    status = device.status()
+    assert (status["position_mm"], status["input_held"], device.stops) == (end, 0, before + 1)
+
+
+def test_a_handle_at_the_velocity_limit_is_not_too_fast():
+    for counts, state in ((80, "RUNNING"), (81, "HOLD")):  # 1 mm a tick is 1,000 mm/s
+        device = Device(step=0.0125, velocity=1000.0)
+        device.go(SET)
+        device.run(counts * np.arange(3))
+        assert device.state == state
 
 
 def test_one_exponential_is_a_set():
@@ -92,6 +101,20 @@ def test_a_second_estop_is_no_second_emergency_but_the_switch_tells_its_cause():
     assert CAUSES[device.status()["hold_reason"]] == "SWITCH" and device.status()["estops"] == estops + 1
 
 
+def test_a_long_loss_of_the_encoder_is_forgotten_as_soon_as_a_short_one():
+    """A bad position counts 10, a good one takes 1 back, and 30 are too many: more than 30 are not kept."""
+    device = Device()
+    staged = device.stage(SET)
+    device.confirm("COMMIT", staged)
+    for _ in range(40):
+        device.tick(valid=False)
+    device.run([0] * 15)
+    device.beat()
+    assert device.confirm("START", staged)[0] == "ACK"
+    device.tick(valid=False)
+    assert device.state == "RUNNING"
+
+
 # What one order leaves to the next
 
 
@@ -104,7 +127,8 @@ def test_another_drive_waits_for_the_end_of_the_first():
     assert list(device.run([0] * 3)[0]) == [-1.0] * 3
 
 
-def test_a_stop_takes_the_rest_of_a_switch_with_it():
+@pytest.mark.parametrize("end", [lambda device: device.must("STOP"), lambda device: device.tick(-5)])
+def test_a_stop_and_a_hand_that_leaves_take_the_rest_of_a_switch_with_them(end):
     device = pressing(slew=100.0)
     staged = device.stage(SOFT, 2)
     device.run([300] * device.status()["ticks_until_ready"])
@@ -112,7 +136,7 @@ def test_a_stop_takes_the_rest_of_a_switch_with_it():
     assert device.confirm("COMMIT", staged)[0] == "ACK"
     device.run([300])
     assert device.offset != 0
-    device.must("STOP")
+    end(device)
     assert device.offset == 0
 
 
