@@ -127,7 +127,7 @@ def test_another_drive_waits_for_the_end_of_the_first():
     assert list(device.run([0] * 3)[0]) == [-1.0] * 3
 
 
-@pytest.mark.parametrize("end", [lambda device: device.must("STOP"), lambda device: device.tick(-5)])
+@pytest.mark.parametrize("end", [lambda device: device.must("STOP"), lambda device: device.run([150, -5])])
 def test_a_stop_and_a_hand_that_leaves_take_the_rest_of_a_switch_with_them(end):
     device = pressing(slew=100.0)
     staged = device.stage(SOFT, 2)
@@ -172,6 +172,15 @@ def test_the_servo_is_a_pi_controller_with_damping():
     error = moved * 0.0127
     inwards = error + 5e-3 * np.cumsum(error) + 0.02 * 12.7
     np.testing.assert_allclose(forces, -inwards, rtol=1e-3)
+
+
+def test_the_servo_s_force_is_within_the_device_s_limit_and_only_there_marked():
+    device = Device(force_limit=5.0, velocity=500.0)
+    device.beat()
+    device.must("DRIVE", mode=1, offset=50.0, duration_ticks=1000, boot_id=7)
+    forces, flags = device.run(3 * (np.arange(300) % 2))  # it flickers, and is not stuck
+    assert device.state == "DRIVING" and forces.min() == -5.0 and forces[-1] == -5.0
+    np.testing.assert_array_equal(flags >> 2 & 1, forces == -5.0)
 
 
 # Passivity at a delay
