@@ -10,7 +10,7 @@ K is the prior covariance of the eta's, of whatever rank (the same stimulus aske
 * The search begins with full Newton steps on the weights a, eta = K a (R & W, algorithm 3.1), which need no R: there
   v = R'a and the same residual is sqrt(r'Kr), r = grad l - a. Where they do not end below the tolerance, because the
   answers conflict at little noise, say, the search begins anew in v, where every start converges: the steps are damped
-  by Armijo's rule (`hilbo.numerics.damped_newton`).
+  by Armijo's rule (`hilbo.newton_steps`).
 * Derivatives of any order come from the stationarity eta = K grad l(eta) by the implicit function theorem, and from
   C = (K + 1/W)^-1 written so that W = 0 is no special case. R, whose derivative may not exist, has no part in them.
 
@@ -24,18 +24,17 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from hilbo.gaussian import (
     GaussianPosterior,
     certify,
     factor,
-    factorise,
     inverse_and_log_determinant,
     square_root,
     still,
 )
-from hilbo.numerics.linalg import one_at_a_time, solve_lower, solve_lower_transposed
+from hilbo.numerics.linalg import one_at_a_time
 
 __all__ = ["Mode", "Pointwise", "Terms", "find_mode", "laplace", "plain_mode"]
 
@@ -140,51 +139,23 @@ def find_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array,
     return one_at_a_time(quick, safe)(arrays, covariance, start)
 
 
-class _PlainState(NamedTuple):
-    following: Float[Array, " n"]  # the weights a after the next full step
-    eta: Float[Array, " n"]  # K a, before it
-    objective: Float[Array, ""]
-    residual: Float[Array, ""]
-    steps: Int[Array, ""]
-    risen: Bool[Array, ""]
-
-
 def plain_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
     """Full Newton steps on the weights, as long as the log posterior rises. `covariance` (n, n), `start` (n,)."""
-    epsilon = jnp.finfo(start.dtype).eps
-    tolerance = jnp.asarray(epsilon ** (2 / 3), start.dtype)
+    import optimistix as optx  # slow to import, and needed only where a fit is traced
 
-    def step(state: _PlainState) -> _PlainState:
-        weights = state.following
-        eta = covariance @ weights
-        values, slope, curvature = terms(eta)
-        root, _, lower = factorise(covariance, curvature)
-        target = curvature * eta + slope
-        half = solve_lower(lower, (root * (covariance @ target))[:, None])
-        following = target - root * solve_lower_transposed(lower, half)[:, 0]
-        off = slope - weights
-        # |off| |K off| >= off' K off, and unlike it cannot be rounded to less than 0.
-        residual = jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(covariance @ off))
-        objective = jnp.sum(values) - 0.5 * weights @ eta
-        slack = 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + jnp.abs(weights @ eta))
-        risen = objective >= state.objective - slack
-        return _PlainState(following, eta, objective, residual, state.steps + 1, risen)
+    from hilbo.newton_steps import FullNewton
 
-    infinite = jnp.asarray(jnp.inf, start.dtype)
-    # Nowhere yet: the first step evaluates the start, so that the terms are compiled once.
-    last = jax.lax.while_loop(
-        lambda state: state.risen & (state.residual > tolerance) & (state.steps < max_steps),
-        step,
-        _PlainState(start, start, -infinite, infinite, jnp.zeros((), jnp.int32), jnp.asarray(True)),
-    )
-    return Mode(last.eta, last.residual, tolerance, last.steps, jnp.zeros_like(tolerance))
+    solution = optx.root_find(_stationarity, FullNewton(), start, (terms, covariance), max_steps=max_steps, throw=False)
+    state, tolerance = solution.state, FullNewton.tolerance(start.dtype)
+    steps = jnp.asarray(solution.stats["num_steps"], jnp.int32)
+    return Mode(state.eta, state.residual, tolerance, steps, jnp.zeros_like(tolerance))
 
 
 def _whitened_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
     """Damped Newton steps in v, from the weights `start`."""
     import optimistix as optx  # slow to import, and needed only where a fit is traced
 
-    from hilbo.numerics.damped_newton import DampedNewton
+    from hilbo.newton_steps import DampedNewton
 
     root, changed = square_root(covariance)
     solution = optx.root_find(

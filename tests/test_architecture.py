@@ -25,7 +25,8 @@ MAY_IMPORT = {
     "acquisition": {"numerics"},
     "likelihoods": {"numerics"},
     "gaussian": {"numerics"},
-    "laplace": {"gaussian"},
+    "newton_steps": {"gaussian"},
+    "laplace": {"newton_steps"},
     "trials": {"numerics"},
     "inference": {"laplace"},
     "fitting_input": {"kernels", "likelihoods", "trials"},
@@ -77,7 +78,7 @@ MOST_ENTRIES = 32  # of hilbo/
 # The mathematics: no files, clock, printing or environment.
 MATHS = {
     *("kernels", "bcm", "numerics", "acquisition", "likelihoods", "gaussian", "laplace", "inference", "ordinal_gp"),
-    *("trials", "fitting_input"),
+    *("trials", "fitting_input", "newton_steps"),
     *("hyperparameters", "population", "mechanics", "viscoelastic", "passivity", "search"),
     *(f"statistics.{name}" for name in ("ordered_logit", "separation", "cluster_robust", "regression")),
     *(

@@ -229,7 +229,11 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
     ("trials = 25", "trials = 4", "32: selection.space_filling is 5; it must be at most trials = 4."),
     ('"ucb"', '"best"', '34: selection.acquisition is "best"; it must be one of "ucb", '),
     ("weight = 0.7", "weight = -1", "35: selection.weight is -1; it must be a number, 0 or above; "),
-    ('rule = "bcm"', 'rule = "rbcm"', '37: aggregation.rule is "rbcm", which was withdrawn: it won no comparison; write'),
+    (
+        'rule = "bcm"',
+        'rule = "rbcm"',
+        '37: aggregation.rule is "rbcm", which was withdrawn: it won no comparison;',
+    ),
     ('rule = "bcm"', 'rule = "mean"', '37: aggregation.rule is "mean"; it must be one of "bcm", '),
     ("[aggregation]\n", "[aggregation]\n[aggregation]\n", "37: is not valid TOML (Cannot declare ('aggregation',) "),
     ("high = 0.99", "high = ", "16: is not valid TOML (Invalid value), fix that line."),

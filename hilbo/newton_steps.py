@@ -1,5 +1,6 @@
-"""Newton's method for the mode of a log-concave posterior in whitened coordinates, by Armijo's rule; an optimistix root
-finder. Apart from `hilbo.laplace`, which imports it where a fit is traced: optimistix is slow to import.
+"""Newton's method for the mode of a log-concave posterior, as two root finders of optimistix: full steps on the
+weights, and damped steps in whitened coordinates. Apart from `hilbo.laplace`, which has the model and imports this
+where a fit is traced: optimistix is slow to import.
 """
 
 from collections.abc import Callable
@@ -8,14 +9,69 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float
 
+from hilbo.gaussian import factorise
 from hilbo.numerics.linalg import cholesky, solve_lower, solve_lower_transposed
 
-__all__ = ["DampedNewton"]
+__all__ = ["DampedNewton", "FullNewton"]
 
 Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
 """Log-likelihood terms, their slopes and curvatures, as `hilbo.laplace` has them."""
+
+
+class _FullState(eqx.Module):
+    """What is known at the weights that were evaluated last."""
+
+    eta: Float[Array, " n"]  # K a
+    objective: Float[Array, ""]
+    residual: Float[Array, ""]
+    risen: Bool[Array, ""]
+
+
+class FullNewton(optx.AbstractRootFinder):
+    """Full steps on the weights a, eta = K a, as long as the log posterior rises (R & W, algorithm 3.1). `args` are the
+    terms and K. One evaluation an iteration, the first of them at the start.
+    """
+
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable = optx.two_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        del fn, args, options, f_struct, aux_struct, tags
+        infinite = jnp.asarray(jnp.inf, y.dtype)
+        return _FullState(y, -infinite, infinite, jnp.asarray(True))
+
+    def step(self, fn, y, args, options, state, tags):
+        del fn, options, tags
+        terms, covariance = args
+        eta = covariance @ y
+        values, slope, curvature = terms(eta)
+        root, _, lower = factorise(covariance, curvature)
+        target = curvature * eta + slope
+        half = solve_lower(lower, (root * (covariance @ target))[:, None])
+        following = target - root * solve_lower_transposed(lower, half)[:, 0]
+        off = slope - y
+        # |off| |K off| >= off' K off, and unlike it cannot be rounded to less than 0.
+        residual = jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(covariance @ off))
+        objective = jnp.sum(values) - 0.5 * y @ eta
+        slack = 4.0 * jnp.finfo(y.dtype).eps * (jnp.sum(jnp.abs(values)) + jnp.abs(y @ eta))
+        return following, _FullState(eta, objective, residual, objective >= state.objective - slack), None
+
+    def terminate(self, fn, y, args, options, state, tags):
+        del fn, args, options, tags
+        return ~(state.risen & (state.residual > self.tolerance(y.dtype))), optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        del fn, args, options, state, tags, result
+        return y, aux, {}
+
+    @staticmethod
+    def tolerance(dtype: DTypeLike) -> Float[Array, ""]:
+        """Of the residual, in standard deviations of the prior."""
+        return jnp.asarray(jnp.finfo(dtype).eps ** (2 / 3), dtype)
 
 
 class _NewtonState(eqx.Module):
