@@ -127,9 +127,11 @@ def test_another_drive_waits_for_the_end_of_the_first():
     assert list(device.run([0] * 3)[0]) == [-1.0] * 3
 
 
-@pytest.mark.parametrize("end", [lambda device: device.must("STOP"), lambda device: device.run([150, -5])])
+@pytest.mark.parametrize(
+    "end", [lambda device: device.must("STOP"), lambda device: device.run([150, -5])]
+)
 def test_a_stop_and_a_hand_that_leaves_take_the_rest_of_a_switch_with_them(end):
-    device = pressing(slew=100.0)
+    device = pressing(slew=50.0, velocity=1990.0)
     staged = device.stage(SOFT, 2)
     device.run([300] * device.status()["ticks_until_ready"])
     device.beat()
@@ -137,6 +139,7 @@ def test_a_stop_and_a_hand_that_leaves_take_the_rest_of_a_switch_with_them(end):
     device.run([300])
     assert device.offset != 0
     end(device)
+    assert device.status()["holds"] == 0
     assert device.offset == 0
 
 
@@ -158,6 +161,17 @@ def test_a_handle_that_moved_before_it_was_stuck_is_stuck():
     device.must("DRIVE", mode=1, offset=15.0, duration_ticks=3000, boot_id=7)
     device.run(np.minimum(3 * np.arange(1500), 200))
     assert device.state == "HOLD" and CAUSES[device.status()["hold_reason"]] == "INPUT"
+
+
+def test_a_handle_is_stuck_after_a_twentieth_of_a_second():
+    """Of pushing with more than an eighth of the limit, more than 128 encoder steps behind its reference."""
+    device = Device(servo_speed=100.0)
+    device.beat()
+    device.must("DRIVE", mode=1, offset=15.0, duration_ticks=3000, boot_id=7)
+    behind = 0.1 * np.arange(1, 400)  # mm
+    pushes = (behind > 128 * 0.0127) & (behind + 5e-3 * np.cumsum(behind) > 40.0 / 8)
+    _, flags = device.run([0] * 399)
+    assert int(np.argmax(flags >> 6 & 1)) == int(np.argmax(pushes)) + 49
 
 
 def test_the_servo_is_a_pi_controller_with_damping():
