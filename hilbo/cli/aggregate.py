@@ -214,9 +214,12 @@ def aggregate_cohort(
 
 def _aggregate_population(study, cohort, team, folder, seed, individuals, say, left_out=()) -> dict[str, Any]:
     """As `aggregate_cohort` for a large cohort or several devices: by the whole crew, of which one process writes."""
+    from hilbo.population.learnt.recipes import RECIPES
     from hilbo.report.large_population import population_map, write_population
     from hilbo.study.estimate.batch_optimum import aggregate_population
 
+    if study.rule in RECIPES:
+        say("learning the hyperparameters from all answers")
     large = aggregate_population(study, cohort, team, seed, individuals=individuals, say=say)
-    grid = population_map(study, large)
-    return {} if folder is None else write_population(study, large, grid, folder, seed, say, left_out)
+    grid = population_map(large.study, large)
+    return {} if folder is None else write_population(large.study, large, grid, folder, seed, say, left_out)

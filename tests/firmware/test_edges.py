@@ -127,9 +127,7 @@ def test_another_drive_waits_for_the_end_of_the_first():
     assert list(device.run([0] * 3)[0]) == [-1.0] * 3
 
 
-@pytest.mark.parametrize(
-    "end", [lambda device: device.must("STOP"), lambda device: device.run([150, -5])]
-)
+@pytest.mark.parametrize("end", [lambda device: device.must("STOP"), lambda device: device.run([150, -5])])
 def test_a_stop_and_a_hand_that_leaves_take_the_rest_of_a_switch_with_them(end):
     device = pressing(slew=50.0, velocity=1990.0)
     staged = device.stage(SOFT, 2)

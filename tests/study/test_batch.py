@@ -18,6 +18,7 @@ from hilbo.study.estimate import distributed
 from hilbo.study.estimate.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.estimate.batch import _one_block, block_size, jets, refit, streamed_cohort, sums
 from hilbo.study.estimate.batch_optimum import aggregate_population, optima_from, optimum_near
+from hilbo.study.estimate.learnt import that_learns
 from hilbo.study.estimate.optimum import population_optimum, predict_people
 
 
@@ -150,6 +151,20 @@ def test_everything_is_as_for_a_small_cohort():
     assert told[0][1] == PEOPLE and (PEOPLE, PEOPLE) in told
     x = np.array([[0.2, 0.9]])
     np.testing.assert_allclose(merged.surface(x), small.surface(x), atol=1e-12)
+
+
+@pytest.mark.deep
+def test_a_rule_that_learns_gives_a_crowd_the_map_of_a_small_cohort():
+    study = that_learns(STUDY)
+    small = aggregate_cohort(study, cohort())
+    large = aggregate_population(study, cohort(), distributed.alone())
+    np.testing.assert_array_equal(large.study.gp.kernel.theta, small.posteriors.gp.kernel.theta[0])
+    np.testing.assert_array_equal(large.optimum.x, small.optimum.x)
+    np.testing.assert_allclose(large.individuals.x, small.individuals.x, atol=1e-6)
+    for rule in ("bcm", "average"):
+        np.testing.assert_allclose(large.alternatives[rule].x, small.alternatives[rule].x, atol=1e-6)
+    x = np.array([[0.2, 0.9]])
+    np.testing.assert_array_equal(large.surface(x), small.surface(x))
 
 
 @pytest.mark.deep

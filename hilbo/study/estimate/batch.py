@@ -23,7 +23,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from hilbo.gaussian import factor, mean_and_explained
-from hilbo.kernels import RBF, gram
+from hilbo.kernels import Stationary, gram
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.population.pointwise import Rule, Sums, terms
@@ -230,7 +230,7 @@ def _one_block(
 class _Predictor(eqx.Module):
     """What it takes of a posterior to predict."""
 
-    kernel: RBF
+    kernel: Stationary
     x: Float[Array, "n d"]
     weights: Float[Array, " n"]
     factor: Float[Array, "n n"]

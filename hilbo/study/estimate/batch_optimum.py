@@ -22,7 +22,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 from hilbo.errors import InputError
 from hilbo.numerics.host import placed
 from hilbo.numerics.tracing import program
-from hilbo.population.maps import share_of
+from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.maps import RuleMap, learnt_map, share_of
 from hilbo.population.pointwise import RULES, Rule, Sums
 from hilbo.population.shared.hierarchical import Share
 from hilbo.search.apart import middle_of
@@ -32,7 +33,8 @@ from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import other_inference
 from hilbo.study.estimate.batch import Jets, SayCount, StreamedCohort, jets, refit, streamed_cohort, sums
 from hilbo.study.estimate.distributed import Crew
-from hilbo.study.estimate.optimum import Optimum
+from hilbo.study.estimate.learnt import resolved
+from hilbo.study.estimate.optimum import Optimum, map_optimum, predict_map
 
 __all__ = ["LargeAggregate", "aggregate_population", "optima_from", "optimum_near"]
 
@@ -48,6 +50,8 @@ _SETTLED = 0.003  # of the search ranges: a Newton step of this size leaves an e
 class LargeAggregate(eqx.Module):
     """What `aggregate.Aggregate` is for a cohort whose posteriors are not kept."""
 
+    study: Study
+    """With the model that the answers say, where its rule learns."""
     cohort: Cohort
     population: StreamedCohort
     certificates: dict[str, np.ndarray]
@@ -57,10 +61,16 @@ class LargeAggregate(eqx.Module):
     alternatives: dict[str, Optimum]
     share: Share | None = None
     """What the answers of an even choice of people say of how people differ, where the rule asks for it."""
+    map: RuleMap | None = None
+    """Of a rule that takes all answers at once; the maps of others are sums over people."""
     hierarchical: None = None
 
     def surface(self, x: Float[np.ndarray, "m d"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Mean and variance (m,) of the population map at points of the unit cube: a pass of the whole crew."""
+        """Mean and variance (m,) of the population map at points of the unit cube; of a map that is a sum over people
+        by a pass of the whole crew."""
+        if self.map is not None:
+            mean, variance = predict_map(self.map, placed(x))
+            return np.asarray(mean), np.asarray(variance)
         study = self.population.study
         prior = np.asarray(jax.vmap(study.gp.kernel.diagonal)(jnp.asarray(x)))
         return sums(self.population, x, "participants asked for the map").merge(
@@ -89,9 +99,12 @@ def aggregate_population(
     """As `aggregate.aggregate_cohort`, in bounded memory and by all devices of the crew.
 
     Without `individuals` nobody's own optimum is sought, which is most of the work. One model of all answers is no
-    alternative here: its cost is cubic in their number.
+    alternative here: its cost is cubic in their number. A rule that learns does so from all answers, at a cost that is
+    linear in people, in each process by itself.
     """
     candidates = np.asarray(search_points(study.space, seed))
+    if study.rule in RECIPES:
+        return _that_learns(resolved(study, cohort), cohort, crew, candidates, individuals, alternatives, say)
     rule = _streamed(study.rule, len(cohort.names))
     share = share_of(study.gp, cohort.trials, study.inference) if rule == "hierarchical" else None
     population = streamed_cohort(study, cohort, crew) if say is None else streamed_cohort(study, cohort, crew, say)
@@ -102,7 +115,34 @@ def aggregate_population(
     others = {"average": best["average"]} if alternatives and rule != "average" else {}
     if alternatives:
         others[other_inference(study)] = _by_other_inference(fitted.population, best[rule])
-    return LargeAggregate(cohort, fitted.population, fitted.certificate, best[rule], fitted.individuals, others, share)
+    optimum = best[rule]
+    return LargeAggregate(
+        study, cohort, fitted.population, fitted.certificate, optimum, fitted.individuals, others, share
+    )
+
+
+def _that_learns(
+    study: Study,
+    cohort: Cohort,
+    crew: Crew,
+    candidates: Float[np.ndarray, "m d"],
+    individuals: bool,
+    alternatives: bool,
+    say: SayCount | None,
+) -> LargeAggregate:
+    """By a rule that has learnt the hyperparameters: the map from all answers at once, everybody's own optimum and the
+    other rules beside it by passes over people."""
+    assert study.learnt is not None
+    map_ = learnt_map(study.learnt, cohort.trials)
+    optimum = map_optimum(study, map_, placed(candidates))
+    people = dataclasses.replace(study, learnt=None)  # of which each program needs the model alone
+    population = streamed_cohort(people, cohort, crew) if say is None else streamed_cohort(people, cohort, crew, say)
+    fitted = refit(population, candidates, individuals)
+    rules: tuple[Rule, ...] = ("bcm", "average") if alternatives else ()
+    others = optima_from(fitted.population, candidates, fitted.sums, rules) if rules else {}
+    return LargeAggregate(
+        study, cohort, fitted.population, fitted.certificate, optimum, fitted.individuals, others, map=map_
+    )
 
 
 def _streamed(rule: str, people: int) -> Rule:
