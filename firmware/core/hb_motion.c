@@ -89,8 +89,7 @@ enum hb_reason hb_start(struct hb_device *device, const struct hb_frame *frame, 
     if (hb_in_contact(&device->safety)) {
         return HB_NACK_IN_CONTACT; /* its force would give energy that the hand has not put in */
     }
-    hb_enter(device, HB_RUNNING, HB_CAUSE_NONE);
-    device->safety.energy = 0;
+    hb_enter(device, HB_RUNNING, HB_CAUSE_NONE); /* its energy counts from the next touch */
     return HB_ACCEPTED;
 }
 

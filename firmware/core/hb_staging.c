@@ -74,8 +74,6 @@ static enum hb_reason check_passivity(const struct hb_config *config, const stru
         nack->limit = config->damping_N_s_per_m;
         return HB_NACK_NOT_PASSIVE;
     }
-    nack->value = 0.0F;
-    nack->limit = 0.0F;
     return HB_ACCEPTED;
 }
 

@@ -43,6 +43,14 @@ def test_a_change_as_large_as_the_slew_limit_is_not_slewed(offset, slewed):
     assert device.status()["slewed"] == slewed and ("slewed" in device.flags) == bool(slewed)
 
 
+def test_a_force_at_the_limit_is_not_marked_saturated():
+    device = Device()
+    device.beat()
+    device.must("DRIVE", mode=0, offset=40.0, duration_ticks=100, boot_id=7)
+    forces, flags = device.run([0] * 40)
+    assert forces[-1] == -40.0 and not np.any(flags >> 2 & 1)
+
+
 @pytest.mark.parametrize("end", [-20.0, 60.0])
 def test_a_home_at_a_count_that_is_an_end_of_the_stroke_is_exact(end):
     device = Device(step=0.0125, capabilities=3)
@@ -115,7 +123,26 @@ def test_a_long_loss_of_the_encoder_is_forgotten_as_soon_as_a_short_one():
     assert device.state == "RUNNING"
 
 
+def test_a_device_at_rest_has_no_flags_and_waits_for_nothing():
+    device = Device()
+    device.tick()
+    assert device.flags == set() and device.status()["ticks_until_ready"] == 0
+
+
 # What one order leaves to the next
+
+
+@pytest.mark.parametrize("mode", [0, 1])
+def test_a_drive_that_has_ended_ramps_down_from_its_force(mode):
+    device = Device(velocity=500.0)
+    device.beat()
+    offset = 3.0 if mode == 0 else 0.5
+    device.must("DRIVE", mode=mode, offset=offset, duration_ticks=40, boot_id=7)
+    forces, _ = device.run([0] * 80)
+    last = forces[38]
+    assert last < -0.4
+    np.testing.assert_allclose(forces[39:59], last * (1 - np.arange(1, 21) / 20), atol=2e-2 * abs(last))
+    assert not np.any(forces[59:])
 
 
 def test_another_drive_waits_for_the_end_of_the_first():

@@ -31,7 +31,7 @@ from hilbo.population.learnt.posterior import (
     model_at,
 )
 from hilbo.population.learnt.recipes import LEARNT_1, Recipe
-from hilbo.population.learnt.search import Search, first_search, searched
+from hilbo.population.learnt.search import LARGEST, Search, first_search, searched
 from hilbo.population.shared.features import pivots_for, unexplained
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.posterior import SharedFunction, shared_function
@@ -48,6 +48,7 @@ _FINE = 1e-3  # of the finite differences for the curvature
 _WORTH = 3.0  # log Bayes factor from which people have widths of their own, about 20 to 1
 _ROUGH = 0.05
 _AT_A_TIME = 2  # draws: much of their arithmetic is of one core
+_MOST_FEATURES, _NUMBERS = 1024, 64_000_000  # of the shared function; of all people's features, half a gigabyte
 _WHOLE = 32  # people, up to whom the curvature in all widths is made: a gradient or two each
 
 
@@ -73,6 +74,8 @@ class Learnt(eqx.Module):
     left: Float[Array, ""]
     """Largest part of the shared function's prior variance, at an answered point, that is not followed."""
     converged: Bool[Array, ""]
+    people: int = eqx.field(static=True)
+    """From whose answers they were learnt."""
 
     def __repr__(self) -> str:
         model, sure = self.model, shown(self.converged)
@@ -90,7 +93,9 @@ def learnt_function(learnt: Learnt, trials: Trials) -> SharedFunction:
     """The posterior of the shared function, and of a random effect, by learnt hyperparameters, from stacked trials (M,
     n): those that were learnt from, or some of them."""
     answers = _as_learnt(learnt, trials)
-    return shared_function(learnt.model, answers, learnt.weights, pivots_for(learnt.model.unit, answers))
+    most = max(LARGEST, min(_MOST_FEATURES, _NUMBERS // answers.blank.size))
+    pivots = pivots_for(learnt.model.unit, answers, most=most)
+    return shared_function(learnt.model, answers, learnt.weights, pivots)
 
 
 def _as_learnt(learnt: Learnt, trials: Trials) -> Tallies:
@@ -165,6 +170,7 @@ def learn(
         rank=jnp.asarray(len(problem.pivots.points)),
         left=left,
         converged=search.cost.usable & jnp.asarray(search.ended) & (left <= _ROUGH),
+        people=len(trials.mask),
     )
 
 

@@ -13,12 +13,13 @@ from hilbo.population.learnt.recipes import Recipe
 from hilbo.population.shared.features import pivots_for
 from hilbo.population.shared.tallies import Tallies
 
-__all__ = ["Search", "first_search", "searched"]
+__all__ = ["LARGEST", "Search", "first_search", "searched"]
 
 _STEPS, _ROUNDS = 100, 8  # of one descent; descents
 _NEAR = 1e-3  # nats that a step must gain for another: a small part of what answers leave open, however many they are
 _REMEMBERED = 30  # steps; with widths of people's own, the 10 of SciPy take a quarter more of them
-_LARGEST = 256  # features: functions that need more are too rugged to be shared by few answers
+LARGEST = 256
+"""Features of a search: functions that need more are too rugged to be shared by few answers."""
 _MOVED = 0.35  # of log theta: features of other lengths leave more, but the RBF's no more than 0.004 of the variance
 _REACH = 1.5  # of log theta, in one descent: where lengths grow far beyond it, features become singular
 # About the standard deviations that 600 answers leave: in these units a search is as wide in all directions.
@@ -38,7 +39,7 @@ class Search(NamedTuple):
 def first_search(start: Coordinates, answers: Tallies, stated: Stated, recipe: Recipe) -> tuple[Search, Problem]:
     """A search that has not moved yet, and its problem."""
     model = model_at(start, answers, stated, recipe.kernel)
-    pivots = pivots_for(model.unit, answers, LEFT, most=_LARGEST)
+    pivots = pivots_for(model.unit, answers, LEFT, most=LARGEST)
     problem = Problem(answers, stated, recipe.priors, recipe.kernel, pivots, model.theta)
     return Search(start, cost_at(start, answers.blank, problem), 0, True), problem
 
@@ -54,7 +55,7 @@ def searched(search: Search, problem: Problem, free: Set[str]) -> tuple[Search, 
         search = _descended(search, problem, free)
         model = model_at(search.coordinates, problem.answers, problem.stated, problem.kernel)
         rank = len(problem.pivots.points)
-        pivots = pivots_for(model.unit, problem.answers, LEFT, fewest=rank, most=_LARGEST)
+        pivots = pivots_for(model.unit, problem.answers, LEFT, fewest=rank, most=LARGEST)
         moved = np.abs(np.log(np.asarray(model.theta)) - np.log(np.asarray(problem.theta)))
         if search.ended and len(pivots.points) == rank and not np.any(moved > _MOVED):
             return search, problem

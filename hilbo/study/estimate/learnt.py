@@ -10,7 +10,8 @@ import numpy as np
 from hilbo.errors import InputError
 from hilbo.population.learnt.posterior import Stated, prior_model
 from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED
-from hilbo.population.learnt.rule import Learnt, learn
+from hilbo.population.learnt.rule import Learnt
+from hilbo.population.learnt.sample import learn_from_sample
 from hilbo.population.maps import ALL_RULES, RuleMap
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
@@ -48,7 +49,7 @@ def resolved(study: Study, cohort: Cohort) -> Study:
     """The study with the model that its answers say, where its rule learns; else the study itself."""
     if study.rule not in RECIPES or study.learnt is not None:
         return study
-    learnt = learn(cohort.trials, len(study.responses), study.stated, RECIPES[study.rule])
+    learnt = learn_from_sample(cohort.trials, len(study.responses), study.stated, RECIPES[study.rule])
     return dataclasses.replace(study, gp=learnt.model.gp, learnt=learnt)
 
 
@@ -71,6 +72,7 @@ def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
         "log_evidence": float(learnt.log_evidence),
         "steps": int(learnt.steps),
         "converged": bool(learnt.converged),
+        "people": learnt.people,
     }
     content["intervals"] = {name: list(ends) for name, ends, _ in _coordinates(study, learnt)}
     content["not_identified"] = [name for name, _, known in _coordinates(study, learnt) if not known]
@@ -126,7 +128,12 @@ def learnt_sentences(study: Study) -> list[str]:
     learnt = study.learnt
     if learnt is None:
         return []
-    sentences = []
+    sentences, people = [], len(learnt.weights)
+    if learnt.people < people:
+        sentences.append(
+            f"The hyperparameters were learnt from {learnt.people:,} of {people:,} people, drawn at random; the map is"
+            " of everybody's answers."
+        )
     unknown = [name for name, _, known in _coordinates(study, learnt) if not known]
     if unknown:
         sentences.append(
