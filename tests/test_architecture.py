@@ -75,6 +75,9 @@ MAY_IMPORT = {
 }
 MOST_MODULES = 16  # in a folder, __init__ not counted
 MOST_ENTRIES = 32  # of hilbo/
+# What types say too little of. These numbers only go down.
+MOST_ANY = 753  # mentions of Any
+MOST_BARE = 463  # functions with a parameter that has no annotation
 # The mathematics: no files, clock, printing or environment.
 MATHS = {
     *("kernels", "bcm", "numerics", "acquisition", "likelihoods", "gaussian", "laplace", "inference", "ordinal_gp"),
@@ -247,6 +250,17 @@ def test_folders_are_small():
     assert len(entries) <= MOST_ENTRIES, sorted(entries)
     modules = Counter(place_of(name) for name in MODULES if "." in name)
     assert {folder: count for folder, count in modules.items() if count > MOST_MODULES} == {}
+
+
+def test_types_say_more_than_before():
+    mentions = bare = 0
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            mentions += isinstance(node, ast.Name) and node.id == "Any"
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+                bare += any(arg.annotation is None for arg in every if arg.arg not in ("self", "cls"))
+    assert (mentions <= MOST_ANY, bare <= MOST_BARE) == (True, True), (mentions, bare)
 
 
 def test_no_cycles():

@@ -43,8 +43,8 @@ FAULTS = (
     Fault(
         "prior counted again for each participant",
         "hilbo/population/pointwise.py",
-        "weight * explained / (prior * remaining)",
-        "weight / remaining",
+        "Sums(explained / (prior * remaining),",
+        "Sums(1.0 / remaining,",
         "tests/population",
     ),
     Fault(
