@@ -135,6 +135,7 @@ static void begin(struct loop *loop)
     loop->rig.config = sim_rig_describe(&config);
     bool slewed = (loop->kind & SLEWED) != 0;
     loop->rig.config.slew_limit_N_per_s = slewed ? (float)exp(draw(loop, log(20.0), log(1000.0))) : 1e6F;
+    loop->rig.config.velocity_limit_mm_per_s = 1900.0F; /* below the plausible step: a light handle in a stiff hand */
     loop->rig.config.delay_us = (loop->kind & DELAYED) != 0 ? 50U * (uint32_t)draw(loop, 1.0, 9.0) : 0U;
     loop->rig.config.capabilities |= loop->controls ? (uint8_t)HB_CAN_CONTROL_PASSIVITY : 0U;
     loop->rig.bad_ticks = loop->rig.late_ticks = 0U;
