@@ -123,6 +123,41 @@ def test_a_long_loss_of_the_encoder_is_forgotten_as_soon_as_a_short_one():
     assert device.state == "RUNNING"
 
 
+def test_a_hold_is_one_stop_and_each_has_a_ramp_of_its_own():
+    device = pressing()
+    for _ in range(2):
+        stops = device.stops
+        forces, flags = device.run([300] * 300, beating=False)  # the host falls silent
+        assert device.state == "HOLD" and device.stops == stops + 1
+        hold = int(np.argmax(flags >> 6 & 1))
+        ramp = forces[hold - 1] * (1 - np.arange(1, 21) / 20)
+        np.testing.assert_allclose(forces[hold : hold + 20], ramp, atol=1e-5)
+        device.beat()
+        device.must("CLEAR", boot_id=7)
+        device.run([150, -5, -5])
+        device.beat()
+        assert device.confirm("START", (1, device.crc))[0] == "ACK"
+        device.run(np.linspace(0, 300, 200))
+
+
+def test_a_device_in_the_air_says_that_nothing_touches_it():
+    device = Device()
+    for counts, contact in ((-5, 0), (0, 0), (5, 1)):
+        device.tick(counts)
+        assert device.status()["contact"] == contact
+
+
+def test_another_version_is_told_beside_the_device_s_own():
+    device = Device(hello=False)
+    kind, nack = device.ask("HELLO", version=7, schema=0)
+    assert (kind, nack["reason"], nack["value"], nack["limit"]) == ("NACK", "VERSION", 7.0, 2.0)
+
+
+def test_an_echo_is_whole():
+    for data in (b"", b"a", bytes(range(1, 60))):
+        assert Device().ask("ECHO", data) == ("ECHO_REPLY", {"payload": data})
+
+
 def test_a_device_at_rest_has_no_flags_and_waits_for_nothing():
     device = Device()
     device.tick()
