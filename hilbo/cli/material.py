@@ -29,7 +29,9 @@ def identify(
     lag: Annotated[str, typer.Option(help='Lag of the force against the position, ms; or "fit".')] = "fit",
     corner: Annotated[
         str,
-        typer.Option(help='Corner of the force\'s filter, Hz; or "fit", "none", "auto" (fit where the data show it).'),
+        typer.Option(
+            help='Corner of the force\'s filter, Hz; "fit", "none", or "auto" (with --lag fit, where the data show it).'
+        ),
     ] = "auto",
     compare: Annotated[bool, typer.Option(help="Refit with other numbers of past samples.")] = True,
     model: Annotated[str, typer.Option(help='For moduli: "fosls" or "fractional-maxwell".')] = "fosls",

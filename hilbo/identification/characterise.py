@@ -88,16 +88,15 @@ def _fitted(
     tests: Sequence[Test], model: Any, say: Callable[[str], None], find_filter: bool
 ) -> tuple[Fit, intervals.Intervals]:
     """The best fit and its intervals, with what of the instrument can be fitted."""
-    timed = isinstance(model, Sampled) and can_be_timed(tests)
-    if isinstance(model, Sampled) and model.lag == "fit" and not timed:
+    fits_lag = isinstance(model, Sampled) and model.lag == "fit"
+    if fits_lag and not can_be_timed(tests):
         model = Sampled(model.N, model.T, model.memory, lag=0.0, corner=model.corner)
+        fits_lag = False
     best_fit = fit(tests, model)
-    if timed and find_filter and model.corner == np.inf:
-        # With a lag that is given the fit may be too far off for the score, whose fit a free lag brings near.
-        near = best_fit if model.lag == "fit" else fit(tests, Sampled(model.N, model.T, model.memory, lag="fit"))
-        if filter_score(near) > _FILTERED:
-            say("a filter of the force")
-            best_fit = fit(tests, Sampled(model.N, model.T, model.memory, lag=model.lag, corner="fit"))
+    # Beside a lag that is held, the score would take what is left of the lag for a filter.
+    if fits_lag and find_filter and model.corner == np.inf and filter_score(best_fit) > _FILTERED:
+        say("a filter of the force")
+        best_fit = fit(tests, Sampled(model.N, model.T, model.memory, lag="fit", corner="fit"))
     say("profile intervals")
     sides = intervals.profile_intervals(best_fit)
     for _ in range(_RESTARTS):

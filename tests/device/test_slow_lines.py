@@ -44,7 +44,7 @@ def pressed(line, **options) -> Renderer:
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.2, 2.0])
 def test_estop_acts_within_the_watchdog_whatever_the_delay(line, delay):
-    with contextlib.suppress(DeviceError), pressed(line):
+    with contextlib.suppress(DeviceError), pressed(line) as device:
         line.delay = delay
         asked = line.tick
         threading.Thread(target=device.link.shout, args=(Estop(),)).start()
@@ -56,7 +56,7 @@ def test_estop_acts_within_the_watchdog_whatever_the_delay(line, delay):
 
 def test_estop_ends_force_where_the_line_loses_every_estop(line):
     """Heartbeats end with the request, so that the device lets go by itself; 3,245 ticks were measured before."""
-    with contextlib.suppress(DeviceError), pressed(line):
+    with contextlib.suppress(DeviceError), pressed(line) as device:
         line.lose = protocol.Estop
         asked = line.tick
         stopping = threading.Thread(target=unanswered, args=(device.estop,))

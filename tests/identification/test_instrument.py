@@ -88,13 +88,6 @@ def test_a_fit_at_the_bounds_of_lag_and_corner_can_be_held():
         Sampled(lag=2e-3 * (1 + 1e-15), corner=corner * (1 - 1e-15))
 
 
-@pytest.mark.deep
-def test_a_filter_is_sought_beside_a_lag_that_is_given():
-    tests = data_set(study.Case("", repeats=1, lag=0.0, corner=200.0), hold=1.0, noise=1e-3)
-    result = characterise(tests, Sampled(lag=0.0), choices=())
-    assert result.estimates["corner"].value == pytest.approx(200, rel=0.05) and "lag" not in result.estimates
-
-
 def test_coordinates_are_named_with_their_units():
     model = Sampled(lag="fit", corner="fit")
     q = jnp.asarray(model.coordinates(*study.TRUTH, lag=2e-4, corner=150.0))
