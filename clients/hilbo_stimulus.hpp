@@ -31,6 +31,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <cerrno>
 #include <chrono>
 #include <cmath>
 #include <condition_variable>
@@ -239,9 +240,19 @@ private:
   void send(const std::string &data) {
     for (size_t done = 0; done < data.size();) {
       const auto part = ::send(socket_, data.data() + done, data.size() - done, send_flags);
+      if (part < 0 && interrupted()) continue;
       if (part <= 0) throw Error("the connection has failed");
       done += static_cast<size_t>(part);
     }
+  }
+
+  // A signal ended a call that has a time limit, as when the process was stopped and goes on.
+  static bool interrupted() {
+#ifdef _WIN32
+    return false;
+#else
+    return errno == EINTR;
+#endif
   }
 
   // More bytes, by a time.
@@ -252,6 +263,7 @@ private:
     char part[4096];
     const auto got = ::recv(socket_, part, sizeof part, 0);
     if (got == 0) throw Error("the server has ended the connection");
+    if (got < 0 && interrupted()) return; // and is called again
     if (got < 0) throw Error("the server does not answer");
     unread_.append(part, static_cast<size_t>(got));
   }

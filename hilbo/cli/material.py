@@ -30,7 +30,7 @@ def identify(
     corner: Annotated[
         str,
         typer.Option(
-            help='Corner of the force\'s filter, Hz; "fit", "none", or "auto" (with --lag fit, where the data show it).'
+            help='Corner of the force\'s filter, Hz; "fit", "none", or "auto" (fit with a fitted lag where it shows).'
         ),
     ] = "auto",
     compare: Annotated[bool, typer.Option(help="Refit with other numbers of past samples.")] = True,
