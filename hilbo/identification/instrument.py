@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from hilbo.identification.fitting import Test
 from hilbo.identification.recorded import AROUND, local_line
+from hilbo.identification.rounding import step_of
 
 __all__ = [
     "FASTEST_FILTER",
@@ -51,10 +52,12 @@ def can_be_timed(tests: Sequence[Test]) -> bool:
 def clear_changes(values: Float[np.ndarray, "R m"]) -> Bool[np.ndarray, " m"]:
     """Rows at which the mean of the repeats changes by more than its noise from the row before, and their neighbours.
 
-    The row before the first one is 0. `values` (R, m), in any unit -> (m,).
+    The row before the first one is 0. An encoder at rest has no noise; when it moves, a change has that of two
+    roundings at most, which repeats may share. `values` (R, m), in any unit -> (m,).
     """
-    mean = values.mean(axis=0)
-    clear = np.abs(np.diff(mean, prepend=0.0)) > _CLEAR * _noise_of_change(mean)
+    mean, step = values.mean(axis=0), step_of(values)
+    noise = max(_noise_of_change(mean), 0.0 if step is None else step / 6**0.5)
+    clear = np.abs(np.diff(mean, prepend=0.0)) > _CLEAR * noise
     return np.convolve(clear, np.ones(2 * AROUND + 1), "same") > 0
 
 

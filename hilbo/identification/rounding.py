@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from hilbo.identification.fitting import Curve
 from hilbo.identification.recorded import circle, local_line
 
-__all__ = ["Rounding", "rounding", "variance_of_rounding"]
+__all__ = ["Rounding", "rounding", "step_of", "variance_of_rounding"]
 
 _HARMONICS = 4
 _SMALLEST, _LARGEST = 1e-7, 5e-3  # step, over the range: less is the arithmetic's, more the programmed input's
@@ -38,7 +38,7 @@ class Rounding(eqx.Module):
 
 def rounding(values: Float[np.ndarray, "R m"], still: Bool[np.ndarray, " m"]) -> Rounding | None:
     """That of a channel at even times, None where noise covers it. `still` (m,): rows that do not move clearly."""
-    step = _step(values)
+    step = step_of(values)
     if step is None:
         return None
     # A fourth difference, which a smooth curve does not have, has the variance of 70 samples.
@@ -52,7 +52,7 @@ def rounding(values: Float[np.ndarray, "R m"], still: Bool[np.ndarray, " m"]) ->
     return Rounding(jnp.asarray(turns), jnp.asarray(step / (np.pi * h) * np.sqrt(left / 2)))
 
 
-def _step(values: Float[np.ndarray, "R m"]) -> float | None:
+def step_of(values: Float[np.ndarray, "R m"]) -> float | None:
     """The smallest difference of distinct values, None where that is no step of a recording.
 
     An input as it was programmed has few values too, but changes by one size from row to row.
