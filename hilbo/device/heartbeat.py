@@ -182,7 +182,7 @@ def keep_beating(line: int, boot_id: int, tick: int, signs: int, out: int, grace
         if signs in ready:
             came = _told(signs)
             if not came:
-                _pass_on(out, waiting, blocking=True)
+                _pass_on(out, waiting, grace)
                 return
             alive, last = time.monotonic(), came.replace(_ALIVE, b"")[-1:]
             quiet = last == _QUIET if last else quiet
@@ -218,16 +218,16 @@ def _arrived(line: int) -> bytes:
     return data
 
 
-def _pass_on(out: int, waiting: bytes, blocking: bool = False) -> bytes:
-    """What `out` does not take now."""
-    os.set_blocking(out, blocking)
-    try:
-        while waiting:
+def _pass_on(out: int, waiting: bytes, patience: float = 0.0) -> bytes:
+    """What `out` does not take now, nor within `patience` s of taking something."""
+    while waiting:
+        try:
             waiting = waiting[os.write(out, waiting) :]
-    except BlockingIOError:
-        pass
-    except OSError:  # the host reads no more
-        return b""
+        except BlockingIOError:
+            if not select.select([], [out], [], patience)[1]:
+                break
+        except OSError:  # the host reads no more
+            return b""
     return waiting
 
 
