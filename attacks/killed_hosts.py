@@ -70,8 +70,8 @@ class Killing:
         self.take_over()
         return "no force within the bound, " + ("pressed" if left.before_N > 0 else "not pressed")
 
-    def killed(self, rng: random.Random) -> Killed:
-        """A host that presses, and is killed at a random moment."""
+    def killed(self, rng: random.Random, least_N: float = 0.0) -> Killed:
+        """A host that renders, and is killed at a random moment; later, once the force is `least_N` or more."""
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         host = subprocess.Popen([sys.executable, "-c", _HOST, self.device.port], **pipes, env=ENVIRONMENT)
         assert host.stdout is not None and host.stderr is not None
@@ -80,6 +80,8 @@ class Killing:
         while ready.is_alive():
             self._keep_up()
         for _ in range(rng.randrange(500, 1100)):  # it began out of contact, and the finger takes some time to press
+            self._keep_up()
+        while self._tick(0)[1] < least_N:
             self._keep_up()
         time.sleep(rng.uniform(0, 0.005))
         host.kill()
