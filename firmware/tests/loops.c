@@ -6,7 +6,9 @@
  * of the set, 16 a force that comes 50 to 400 us late, for which the device checks its sets. The host asks for a START
  * whenever the device is STOPPED, in contact too. A line: kind, runs, ticks while RUNNING, HOLDs, largest force out of
  * contact (N), largest energy made in a touch (mJ): by how much force and physical damping together ever gave the hand
- * more than they had taken from it; STARTs in contact, and touches that began with one.
+ * more than they had taken from it; STARTs in contact, and touches that began with one; the same energy of touches in
+ * which the force was cut, at the limit of its set or at 0, because no force pulls inwards; HOLDs of a hand beyond the
+ * velocity limit, which are not among the others.
  * CONTROLS 1: with the passivity controller. */
 #include <math.h>
 #include <stdio.h>
@@ -25,6 +27,8 @@ struct outcome {
     double made_mJ;
     unsigned long asked_in_contact;
     unsigned long begun_in_contact;
+    double cut_mJ;
+    unsigned long too_fast;
 };
 
 struct loop {
@@ -40,6 +44,8 @@ struct loop {
     bool pressed;    /* in contact, in any state */
     unsigned long asked_in_contact;
     double taken_mJ; /* in this touch */
+    bool cut;        /* in this touch */
+    bool held;       /* at the last tick */
 };
 
 static double draw(struct loop *loop, double low, double high)
@@ -135,7 +141,6 @@ static void begin(struct loop *loop)
     loop->rig.config = sim_rig_describe(&config);
     bool slewed = (loop->kind & SLEWED) != 0;
     loop->rig.config.slew_limit_N_per_s = slewed ? (float)exp(draw(loop, log(20.0), log(1000.0))) : 1e6F;
-    loop->rig.config.velocity_limit_mm_per_s = 1900.0F; /* below the plausible step: a light handle in a stiff hand */
     loop->rig.config.delay_us = (loop->kind & DELAYED) != 0 ? 50U * (uint32_t)draw(loop, 1.0, 9.0) : 0U;
     loop->rig.config.capabilities |= loop->controls ? (uint8_t)HB_CAN_CONTROL_PASSIVITY : 0U;
     loop->rig.bad_ticks = loop->rig.late_ticks = 0U;
@@ -146,7 +151,7 @@ static void begin(struct loop *loop)
     loop->rig.motor_N = 0.0;
     loop->rig.motor_sign = 1.0;
     loop->rig.encoder_sign = 1;
-    loop->rig.stop_open = loop->ran = loop->touched = loop->pressed = false;
+    loop->rig.stop_open = loop->ran = loop->touched = loop->pressed = loop->cut = loop->held = false;
     loop->rig.late_us = 0U;
     loop->rig.delay_us = loop->rig.config.delay_us;
     loop->asked_in_contact = 0UL;
@@ -199,8 +204,16 @@ static void measure(struct loop *loop, double force_N, double before_mm, struct 
     }
     if (running && touches && !loop->touched) {
         loop->taken_mJ = 0.0;
+        loop->cut = false;
     }
+    bool at_limit = (device->safety.flags & (uint16_t)HB_FLAG_SATURATED) != 0U;
+    loop->cut = loop->cut || at_limit || (loop->touched && touches && force_N == 0.0);
     outcome->begun_in_contact += running && touches && !loop->ran && loop->pressed ? 1UL : 0UL;
+    bool held = device->state == (uint8_t)HB_HOLDING;
+    if (held && !loop->held) {
+        *(device->cause == (uint8_t)HB_CAUSE_VELOCITY ? &outcome->too_fast : &outcome->holds) += 1UL;
+    }
+    loop->held = held;
     loop->ran = running;
     loop->pressed = touches;
     loop->touched = running && touches;
@@ -208,7 +221,8 @@ static void measure(struct loop *loop, double force_N, double before_mm, struct 
         double moved_mm = world->position_mm - before_mm;
         double speed_m_per_s = moved_mm / (1e3 * world->config.tick_s);
         loop->taken_mJ += (force_N + world->config.damping_N_s_per_m * speed_m_per_s) * moved_mm;
-        outcome->made_mJ = fmax(outcome->made_mJ, -loop->taken_mJ);
+        double *made_mJ = loop->cut ? &outcome->cut_mJ : &outcome->made_mJ;
+        *made_mJ = fmax(*made_mJ, -loop->taken_mJ);
     }
 }
 
@@ -226,7 +240,6 @@ static void run(struct loop *loop, struct outcome *outcome)
         measure(loop, force_N, before_mm, outcome);
     }
     outcome->runs += 1U;
-    outcome->holds += loop->rig.device.safety.count.holds;
     outcome->asked_in_contact += loop->asked_in_contact;
 }
 
@@ -243,8 +256,8 @@ int main(int count, char **arguments)
     }
     for (int kind = 0; kind < KINDS; kind++) {
         const struct outcome *o = &outcomes[kind];
-        (void)printf("%d %lu %lu %lu %.6g %.6g %lu %lu\n", kind, o->runs, o->ticks, o->holds, o->out_of_contact_N, o->made_mJ,
-                     o->asked_in_contact, o->begun_in_contact);
+        (void)printf("%d %lu %lu %lu %.6g %.6g %lu %lu %.6g %lu\n", kind, o->runs, o->ticks, o->holds, o->out_of_contact_N,
+                     o->made_mJ, o->asked_in_contact, o->begun_in_contact, o->cut_mJ, o->too_fast);
     }
     return EXIT_SUCCESS;
 }
