@@ -93,7 +93,7 @@ def _fitted(
         model = Sampled(model.N, model.T, model.memory, lag=0.0, corner=model.corner)
         fits_lag = False
     best_fit = fit(tests, model)
-    # Beside a lag that is held, the score would take what is left of the lag for a filter.
+    # With a fixed lag, the score would attribute a residual lag to a filter.
     if fits_lag and find_filter and model.corner == np.inf and filter_score(best_fit) > _FILTERED:
         say("a filter of the force")
         best_fit = fit(tests, Sampled(model.N, model.T, model.memory, lag="fit", corner="fit"))

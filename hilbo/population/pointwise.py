@@ -15,7 +15,7 @@ h_j is noise to it. p = 1 is the Bayesian committee machine, which says that peo
 plain mean of the latents, in which everybody counts the same.
 
 The sums may be made at once (`aggregate`), or of blocks of people that are added up (`hilbo.study.estimate.batch`).
-Reference: Tresp (2000). Products of experts, rbcm and grbcm were measured beside these and won nowhere
+Reference: Tresp (2000). Products of experts, rbcm and grbcm were better on no population
 (docs/methods/aggregation.md).
 """
 

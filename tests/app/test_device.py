@@ -182,7 +182,7 @@ def felt_again(live, pending, condition):
     live.until(lambda v: v["device"]["state"] != "lost" and v["phase"] in ("hello", "trouble"), live.whole)
     assert live.hub.rig.snapshot.state in ("STOPPED", "HOLD")
     if "clear" in live.whole()["may"]:
-        live.clear()
+        live.command("clear")
     live.begin()
     live.answer()
     assert live.hub.state.trials[pending.id].renderings == pending.renderings
@@ -232,7 +232,7 @@ def test_a_hold_while_the_disk_is_full_voids_its_trial_as_soon_as_there_is_room(
         with full_disk(live, monkeypatch) as tried:
             live.hub.rig.device.simulator.tell("bad 5")
             live.until(lambda v: "clear" in v["may"] and tried, live.whole)
-            live.clear()
+            live.command("clear")
             live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
             assert live.hub.state.trials[0].status == "pending"
         live.until(lambda v: v["whole"]["trials"][0]["status"] == "void", live.whole)
@@ -287,7 +287,7 @@ def test_a_killed_server_goes_on_with_the_same_trial_on_a_device_that_held_meanw
             assert live.hub.rig.snapshot.state == "HOLD"
             live.device_did("ready", "stopped")
             assert not live.answer(view)["again"]  # which was kept by the browser
-            live.clear()
+            live.command("clear")
             live.begin()
             live.answer()
             assert [t.status for t in live.hub.state.trials[:2]] == ["answered", "answered"]

@@ -121,6 +121,27 @@ def test_no_order_ends_a_stop_that_came_after_it_was_requested(doings):
     assert all(in_time for _, in_time in ended_by), ended_by
 
 
+def test_a_clear_after_the_rig_s_own_stop_is_carried_out():
+    """The stop of a trial's end waits before it in the queue."""
+    device = FakeDevice()
+
+    async def held(rig):
+        device.stopped_by(HoldReason.VELOCITY, State.HOLD)
+        busy = threading.Event()
+        rig.do(lambda _: busy.wait(10))
+        rested = asyncio.ensure_future(rig.rest())
+        await asyncio.sleep(0)
+        cleared = asyncio.ensure_future(rig.clear())
+        await asyncio.sleep(0)
+        busy.set()
+        await rested
+        await cleared
+        assert device.now == State.STOPPED
+
+    with rig_of(device) as rig:
+        asyncio.run(held(rig))
+
+
 def test_a_clear_that_comes_late_is_refused_in_a_sentence():
     device = FakeDevice()
 

@@ -82,7 +82,7 @@ def test_an_emergency_stop_while_the_hand_is_waited_for_stays_until_it_is_cleare
         live.fake.pressed = False
         live.device_did("ready", "estop")
         assert live.fake.now == State.ESTOP and "start" not in live.fake.told
-        live.clear()
+        live.command("clear")
         live.answer()
 
 

@@ -137,14 +137,16 @@ def test_influences_are_refits_to_first_order(fitted):
 
 @pytest.mark.deep
 def test_white_noise_has_the_classical_cut():
-    fitted = fit(foam_tests(noise=0.01, hold=0.5, seed=3), Sampled())
-    around = intervals.spread(fitted)
-    m, p = sum(c.time.size for c in fitted.curves), 4
-    assert [int(part.order) for part in residual_noise.noise(fitted)] == [0, 0]
-    classical = student.ppf(0.975, m - p) ** 2 * float(fitted.solution.cost)
-    # Two curves of different length have weights of their own, and the creep test is fitted in its force: the classical
-    # cut is met to first order.
-    assert np.asarray(around.cut) == pytest.approx(np.full(4, classical / m), rel=0.9)
+    """On average over data sets: in each the noise is estimated, slow noise included."""
+    ratios = []
+    for seed in range(3, 7):
+        fitted = fit(foam_tests(noise=0.01, hold=0.5, seed=seed), Sampled())
+        m, p = sum(c.time.size for c in fitted.curves), 4
+        assert [int(part.order) for part in residual_noise.noise(fitted)] == [0, 0]
+        classical = student.ppf(0.975, m - p) ** 2 * float(fitted.solution.cost)
+        ratios.append(np.asarray(intervals.spread(fitted).cut) * m / classical)
+    # Two curves of different length have weights of their own, so that the classical cut is met to first order.
+    assert np.mean(ratios, axis=0) == pytest.approx(np.ones(4), rel=0.6)
 
 
 @pytest.mark.deep

@@ -199,17 +199,6 @@ class Live:
         """An experimenter's command."""
         return self.experimenter.post(f"/api/experimenter/{name}", content)
 
-    def clear(self):
-        """Clear hold, pressed until it is done: a stop of the session's own may be on its way to the device, and an
-        order that was made before it is refused."""
-
-        def cleared(_):
-            with contextlib.suppress(urllib.error.HTTPError):
-                return self.command("clear")
-            return False
-
-        self.until(cleared)
-
     def events(self, kind=None):
         """What is in the log, on the disk."""
         return [event for event in read_log(self.path, self.study)[1] if kind in (None, event.kind)]

@@ -51,6 +51,7 @@ class DeviceRig:
         self._mechanics: dict[str | None, Mechanics | None] = {}
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future] | None] = queue.SimpleQueue()
         self._ending = threading.Event()
+        self._own_stops, self._stopping = 0, 0  # STOPs of this rig that were acknowledged; 1 while one is on its way
         self.device = connect()
         self._counter = SampleCounter(lambda: self.device.samples(0).flags)  # what has arrived, without waiting
         self.simulated = bool(self.device.can & Capability.SIMULATED)
@@ -78,8 +79,8 @@ class DeviceRig:
         return loaded
 
     async def show(self, showing: Showing) -> None:
-        """The set in force, from now on, once nobody presses; nothing where it is rendered already. The reference
-        is not rendered here."""
+        """Render the set in force once the handle is out of contact; a no-op if it is rendered already, and for the
+        reference, which is not rendered here."""
         if showing.step == 0:
             self._counter.begin((showing.trial, showing.presentation))
         if showing.values is None:
@@ -97,7 +98,7 @@ class DeviceRig:
 
     async def rest(self) -> None:
         """The renderer rests; told even if this is left."""
-        stopped = asyncio.wrap_future(self.do(lambda device: device.stop()))
+        stopped = asyncio.wrap_future(self.do(self._stop))
         stopped.add_done_callback(_looked_at)
         await asyncio.shield(stopped)
 
@@ -106,9 +107,23 @@ class DeviceRig:
         await asyncio.get_running_loop().run_in_executor(None, self.device.estop)
 
     async def clear(self) -> None:
-        """Go on after the hold or stop that was known when this was called, and after no later one."""
+        """Go on after the hold or stop that was known when this was called, and after no later one.
+
+        A STOP of this rig that was requested before, and reaches the device in between, is no later one: each that is
+        acknowledged counts one. `stops` is read first, and one that is on its way now is not counted: then the order
+        may be refused, and never names a stop that is to come.
+        """
         stop = self.device.link.stops
-        await asyncio.wrap_future(self.do(lambda device: device.clear(stop=stop)))
+        own = self._own_stops + self._stopping
+        await asyncio.wrap_future(self.do(lambda device: device.clear(stop=stop + self._own_stops - own)))
+
+    def _stop(self, device: Renderer) -> None:
+        self._stopping = 1
+        try:
+            device.stop()
+            self._own_stops += 1
+        finally:
+            self._stopping = 0
 
     def hang_up(self) -> None:
         """Nobody waits for a device."""

@@ -1,8 +1,8 @@
-"""Hyperparameters of a crowd: learnt from a random sample of its people, at a bounded cost.
+"""Hyperparameters of a large population, learnt from a random sample of people, so that time and memory are bounded.
 
-25,000 answers determine what people have in common far better than they determine the best rendering; docs/methods/
-which_method.md has how little a smaller sample moves it. The map is of everybody's answers. Where people have widths of
-their own, those outside the sample get theirs by what the sample says of all others, block by block.
+docs/methods/which_method.md has a table of how far the optimum moves with the size of the sample. The map uses the
+answers of all people. Where the model has individual threshold widths, those of people outside the sample are fitted
+block by block, with the other hyperparameters fixed.
 """
 
 import dataclasses
@@ -24,14 +24,17 @@ from hilbo.population.shared.tallies import tallied
 __all__ = ["SAMPLE", "learn_from_sample"]
 
 SAMPLE = 1000
-"""People from whom the hyperparameters are learnt, where there are more."""
+"""Largest sample of people from which the hyperparameters are learnt."""
 _FINE = 1e-3  # of the finite difference for the curvature in a width
 
 
 def learn_from_sample(
     trials: Trials, categories: int, stated: Stated = NOTHING, recipe: Recipe = LEARNT_1, most: int = SAMPLE
 ) -> Learnt:
-    """`learn` from the stacked trials (M, n) of at most so many people, drawn at random from those who answered."""
+    """Hyperparameters by `recipe`, learnt from a random sample of at most `most` of the people who answered.
+
+    `trials`: stacked, (M, n). Other arguments and errors are those of `learn`.
+    """
     answered = np.flatnonzero(np.asarray(trials.mask).any(axis=1))
     if len(answered) <= most:
         return learn(trials, categories, stated, recipe)
@@ -64,8 +67,8 @@ class _Widths(NamedTuple):
 
 
 def _widths(learnt: Learnt, trials: Trials, categories: int, stated: Stated, recipe: Recipe) -> _Widths:
-    """Of people whose answers were not learnt from; what all people have in common stays. Their widths are taken for
-    independent, as those of many people are where they are learnt."""
+    """Widths of people outside the sample, with the other hyperparameters of `learnt` fixed. Standard deviations are
+    from the curvature in each width alone, as for many people in `learn`."""
     answers = tallied(trials, categories)
     start = learnt.coordinates | {"widths": jnp.zeros(len(trials.mask))}
     pivots = pivots_for(learnt.model.unit, answers, LEFT, most=LARGEST)

@@ -131,8 +131,8 @@ def learnt_sentences(study: Study) -> list[str]:
     sentences, people = [], len(learnt.weights)
     if learnt.people < people:
         sentences.append(
-            f"The hyperparameters were learnt from {learnt.people:,} of {people:,} people, drawn at random; the map is"
-            " of everybody's answers."
+            f"The hyperparameters were learnt from a random sample of {learnt.people:,} of {people:,} people; the map"
+            " uses the answers of all."
         )
     unknown = [name for name, _, known in _coordinates(study, learnt) if not known]
     if unknown:
