@@ -25,7 +25,12 @@ pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform == "win32", reas
 
 def finished(study, folder, arguments, kills, most):
     """The log of a session that was killed so often, each time `most` s after its start, or before it was there."""
-    session, amid = Session(folder, arguments), 0
+    with contextlib.closing(Session(folder, arguments)) as session:
+        return _finished(session, study, kills, most)
+
+
+def _finished(session, study, kills, most):
+    amid = 0
     for number in range(kills):
         session.start()
         if number % 10 == 9:  # in the middle of starting
@@ -89,9 +94,10 @@ def test_a_kill_while_a_device_of_its_own_renders_loses_not_even_the_click(tmp_p
         study, ["P01"], 0, "validation", sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
     )
     (tmp_path / "plan.json").write_text(json.dumps(plan))
-    with contextlib.closing(Simulator(finger="none")) as device:
+    with contextlib.ExitStack() as ended:
+        device = ended.enter_context(contextlib.closing(Simulator(finger="none")))
         arguments = [str(file), "--participant", "P01", "--plan", str(tmp_path / "plan.json"), "--device", device.port]
-        session = Session(tmp_path / "killed", arguments)
+        session = ended.enter_context(contextlib.closing(Session(tmp_path / "killed", arguments)))
         session.start()
         session.until(session.ready)
 

@@ -88,6 +88,11 @@ class Session:
         os.kill(self.process.pid, signal.SIGKILL)
         self.process.join()
 
+    def close(self):
+        """No server is left, whatever a test has found: it would take the next device by its name."""
+        if self.process is not None and self.process.is_alive():
+            self.kill()
+
     def act(self):
         """One look at the view, and what a participant would do; the phase. An answer is kept until acknowledged."""
         try:
