@@ -113,8 +113,12 @@ def multiplier(
 
 
 def _late_filter(lag: Float[Array, ""], tau: Float[Array, ""], z: Complex[Array, " w"]) -> Complex[Array, " w"]:
-    """The multiplier of A x at a time `lag` samples earlier, exact also within a sample: lag and filter do not act one
-    after the other, because the shifted signal is bent between samples."""
+    """The multiplier of a first-order filter (time constant `tau`, samples) and a delay by `lag` samples together.
+
+    Exact for a signal that is straight between its samples, also for a fractional lag: the delayed signal has its bends
+    between samples, so that a filter for signals straight between samples must not be applied after the delay.
+    """
+    # At the largest lag the part is a whole sample, which the formula covers as well.
     whole = jnp.clip(jnp.floor(lag), -LARGEST_LAG, LARGEST_LAG - 1)
     part, m = lag - whole, _shift(-whole, z)
     e, g, decay = jnp.exp(-1 / tau), tau * (1 - jnp.exp(-1 / tau)), jnp.exp((part - 1) / tau)

@@ -146,7 +146,7 @@ class Sampled(eqx.Module):
         if not even:
             ends = np.minimum(np.searchsorted(place, np.arange(count)), place.size - 1)  # of each tick's line
             changes = changes * clear[ends]
-        # A position that is late is that of a force which knows more: the input goes on as it ended.
+        # Where the position is late, the last forces depend on later input, which is extrapolated linearly.
         changes = np.pad(changes, ((0, 0), (0, instrument.LARGEST_LAG)), mode="edge")
         before = np.minimum(place.astype(int), count - 2)
         regular = bool(place.size == count and np.all(place == np.arange(count)))

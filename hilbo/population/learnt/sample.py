@@ -43,27 +43,29 @@ def learn_from_sample(
     people, room = len(trials.mask), tallied(trials, categories).x.shape[1]
     weights = np.zeros((people, room))
     weights[rows, : learnt.weights.shape[1]] = learnt.weights
-    widths, sd = np.zeros(people), np.zeros(people)
+    widths, sd, ended = np.zeros(people), np.zeros(people), True
     if learnt.widths:
         widths[rows], sd[rows] = learnt.coordinates["widths"], learnt.sd["widths"]
         others = np.setdiff1d(np.arange(people), rows)
         for block in np.array_split(others, -(-len(others) // most)):
             own = _widths(learnt, _of(trials, block), categories, stated, recipe)
-            widths[block], sd[block] = own.log, own.sd
+            widths[block], sd[block], ended = own.log, own.sd, ended and own.ended
         learnt = dataclasses.replace(
             learnt,
             coordinates=learnt.coordinates | {"widths": jnp.asarray(widths)},
             sd=learnt.sd | {"widths": jnp.asarray(sd)},
+            converged=learnt.converged & ended,
         )
     model = dataclasses.replace(learnt.model, log_widths=jnp.asarray(widths))
     return dataclasses.replace(learnt, model=model, weights=jnp.asarray(weights), people=most)
 
 
 class _Widths(NamedTuple):
-    """Logarithms of people's widths, and the standard deviations of their posterior."""
+    """Logarithms of people's widths, the standard deviations of their posterior, and whether the search ended there."""
 
     log: Float[np.ndarray, " M"]
     sd: Float[np.ndarray, " M"]
+    ended: bool
 
 
 def _widths(learnt: Learnt, trials: Trials, categories: int, stated: Stated, recipe: Recipe) -> _Widths:
@@ -79,7 +81,7 @@ def _widths(learnt: Learnt, trials: Trials, categories: int, stated: Stated, rec
     ahead = cost_at(moved, search.cost.weights, problem).gradient["widths"]
     curvature = np.asarray(ahead - search.cost.gradient["widths"]) / _FINE
     sd = np.where(curvature > 0, 1 / np.sqrt(np.where(curvature > 0, curvature, 1.0)), np.inf)
-    return _Widths(np.asarray(search.coordinates["widths"]), sd)
+    return _Widths(np.asarray(search.coordinates["widths"]), sd, search.ended and bool(search.cost.usable))
 
 
 def _of(trials: Trials, rows: Int[np.ndarray, " r"]) -> Trials:
