@@ -23,7 +23,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.errors import InputError
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.numerics.shown import concrete, float_dtype, numbers
 
 __all__ = ["Evidence", "average", "combine", "combine_explained", "stream"]
@@ -194,7 +194,7 @@ def _people(
 def _present(mask: Numbers | None, means: Float[Array, "M m"]) -> Bool[Array, " M"]:
     """Who is present. Raises `InputError` for what is not one flag for each participant."""
     if mask is None:
-        return placed(np.ones(means.shape[0], bool))
+        return to_device(np.ones(means.shape[0], bool))
     flags = numbers("bcm", "mask", mask)
     if flags.dtype != bool or flags.shape != means.shape[:1]:
         raise InputError(

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.numerics.linalg import cholesky, eigh, solve_lower
-from hilbo.numerics.shown import known, shown
+from hilbo.numerics.shown import has_values, shown
 
 __all__ = [
     "Certificate",
@@ -89,7 +89,7 @@ class GaussianPosterior(eqx.Module):
     certificate: Certificate
 
     def __repr__(self) -> str:
-        if not known(self.mode, self.log_evidence) or self.mode.ndim != 1:
+        if not has_values(self.mode, self.log_evidence) or self.mode.ndim != 1:
             return eqx.tree_pformat(self)
         return f"GaussianPosterior({self.mode.shape[0]} values, log evidence {shown(self.log_evidence)})"
 

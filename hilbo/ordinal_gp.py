@@ -30,7 +30,7 @@ from hilbo.inference.exact import ExactPosterior, SamplingCertificate, exact
 from hilbo.kernels import RBF, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit, OrdinalTerms, TiltedTerms
-from hilbo.numerics.shown import concrete, floats, known, numbers, shown
+from hilbo.numerics.shown import concrete, floats, has_values, numbers, shown
 from hilbo.trials import Trials
 
 __all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"]
@@ -153,7 +153,7 @@ class Posterior(eqx.Module):
 
     def __repr__(self) -> str:
         mask = self.trials.mask
-        if not known(self.trials.x, mask) or not concrete(self) or mask.ndim > 2:
+        if not has_values(self.trials.x, mask) or not concrete(self) or mask.ndim > 2:
             return eqx.tree_pformat(self)
         if mask.ndim == 2:
             sure = np.asarray(self.latent.certificate.converged)

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
-from hilbo.numerics.shown import concrete, floats, known, numbers, shown
+from hilbo.numerics.shown import concrete, floats, has_values, numbers, shown
 
 __all__ = ["Trials"]
 
@@ -68,7 +68,7 @@ class Trials(eqx.Module):
         return cls(*jax.device_put((padded, categories, np.arange(capacity) < count)))
 
     def __repr__(self) -> str:
-        if not known(self.x, self.mask):
+        if not has_values(self.x, self.mask):
             return eqx.tree_pformat(self)
         people = f"{self.x.shape[0]} people, " if self.mask.ndim == 2 else ""
         return (

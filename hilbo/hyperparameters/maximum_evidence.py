@@ -33,7 +33,7 @@ from hilbo.hyperparameters.cost import divisor, evidence_cost
 from hilbo.numerics.linalg import eigh, one_at_a_time
 from hilbo.numerics.newton import Expansion, TrustRegionNewton, arrives
 from hilbo.numerics.polytope import Polytope, projector, walls_of_cube
-from hilbo.numerics.shown import known, shown
+from hilbo.numerics.shown import has_values, shown
 from hilbo.ordinal_gp import OrdinalGP, Trials
 
 __all__ = ["MaximumEvidence", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
@@ -58,7 +58,7 @@ class MaximumEvidence(eqx.Module):
     learn: tuple[str, ...] = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        if not known(self.log_evidence, self.steps, self.converged, self.runaway):
+        if not has_values(self.log_evidence, self.steps, self.converged, self.runaway):
             return eqx.tree_pformat(self)
         ended = "a hyperparameter ran away" if np.any(self.runaway) else "converged"
         ended = ended if np.all(self.converged) else "NOT converged"

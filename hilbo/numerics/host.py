@@ -1,5 +1,7 @@
-"""Small things are computed on the host: outside of a trace every operation of JAX, on every shape, is a program of its
-own, which takes ten milliseconds to trace, lower and load and nothing to run.
+"""Functions that compute with NumPy or with JAX, and the transfer of values to the device.
+
+Outside of a trace every operation of JAX on a new shape is a program of its own: it takes ten milliseconds to trace,
+lower and load, and nothing to run. Small computations are therefore done by NumPy.
 """
 
 import functools
@@ -8,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["floating", "namespace_of", "on_host", "placed", "scan"]
+__all__ = ["floating", "namespace_of", "on_host", "scan", "to_device"]
 
 
 def namespace_of(*values: Any) -> Any:
-    """NumPy where all values are NumPy's or plain numbers, else `jax.numpy`, which is imported only then: for functions
-    that are written once and give what they are given."""
+    """`numpy` where all values are NumPy arrays or plain numbers, else `jax.numpy`, which is imported only then: for
+    functions that are written once and return the kind of array that they were given."""
     if all(isinstance(value, np.ndarray | np.generic | float | int) for value in values):
         return np
     import jax.numpy as jnp
@@ -22,12 +24,12 @@ def namespace_of(*values: Any) -> Any:
 
 
 def on_host(*values: Any) -> bool:
-    """Whether all are NumPy's numbers: what is computed of them is computed by NumPy."""
+    """Whether all values are NumPy arrays or scalars."""
     return all(isinstance(value, np.ndarray | np.generic) for value in values)
 
 
 def scan(step: Callable[[Any, Any], Any], start: Any, over: Any) -> Any:
-    """The last of `step`'s results, from `start` over the numbers of an array: a loop of NumPy's or of JAX's."""
+    """Fold `step(carry, value)` over the first axis of an array: a loop for NumPy arrays, else `jax.lax.scan`."""
     if on_host(over):
         return functools.reduce(step, over, start)
     import jax
@@ -35,8 +37,9 @@ def scan(step: Callable[[Any, Any], Any], start: Any, over: Any) -> Any:
     return jax.lax.scan(lambda carry, value: (step(carry, value), None), start, over)[0]
 
 
-def placed(value: Any, dtype: Any = None) -> Any:
-    """As `jnp.asarray`, without a program where the value is on the host; a copy, so that the host's may change."""
+def to_device(value: Any, dtype: Any = None) -> Any:
+    """A JAX array of a value: as `jnp.asarray`, without compiling anything where the value is NumPy's or Python's. The
+    copy does not change with the original."""
     import jax
 
     if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
@@ -45,6 +48,6 @@ def placed(value: Any, dtype: Any = None) -> Any:
 
 
 def floating(x: Any) -> Any:
-    """Floating-point numbers; NumPy's where they are NumPy's, with which small things are computed faster."""
+    """The values as floating-point numbers of the default type; NumPy arrays stay NumPy arrays."""
     xp = namespace_of(x)
     return xp.asarray(x, xp.result_type(1.0, x))

@@ -1,4 +1,4 @@
-"""Short words for records of arrays: what a notebook or a debugger shows of them."""
+"""Conversion and validation of numeric arguments, and the short text of arrays in representations and messages."""
 
 from typing import Any
 
@@ -9,18 +9,19 @@ from jax.core import Tracer
 from jax.typing import DTypeLike
 
 from hilbo.errors import InputError
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 
-__all__ = ["check_positive", "concrete", "float_dtype", "floats", "known", "numbers", "shown"]
+__all__ = ["check_positive", "concrete", "float_dtype", "floats", "has_values", "numbers", "shown"]
 
 
 def concrete(*values: Any) -> bool:
-    """Whether these are numbers, and not what JAX traces or maps over."""
+    """Whether no leaf of the values is a tracer."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
-def known(*values: Any) -> bool:
-    """Whether these are arrays with numbers in them: else a record is a tree of something else, or traced."""
+def has_values(*values: Any) -> bool:
+    """Whether all are arrays with values. The fields of a record are not where it is traced, or a tree of other
+    things, as of axes for `vmap`."""
     return all(isinstance(value, jax.Array | np.ndarray) and not isinstance(value, Tracer) for value in values)
 
 
@@ -33,31 +34,33 @@ def float_dtype(value: Any) -> np.dtype:
 
 
 def floats(array: Any, dtype: DTypeLike | None = None) -> Any:
-    """An array of floating-point numbers as it is; whole numbers, yes and no in this dtype, else in the default one:
-    what takes its dtype from an array would cut its own numbers off to whole ones."""
+    """A floating-point array unchanged; integers and booleans converted to `dtype`, or to the default float type.
+
+    Otherwise code that takes its dtype from the array would round its own numbers to integers."""
     if jnp.issubdtype(array.dtype, jnp.floating):
         return array
     return array.astype(jnp.result_type(float) if dtype is None else dtype)
 
 
 def numbers(whose: str, name: str, value: Any, dtype: DTypeLike | None = None) -> jax.Array:
-    """A value as an array. Raises `InputError` for what holds no numbers, or rows of different lengths."""
+    """A value as a JAX array. Raises `InputError` for non-numeric values and for rows of different lengths."""
     try:
-        return placed(value, dtype)
+        return to_device(value, dtype)
     except (TypeError, ValueError):
         words = repr(value)
         raise InputError(f"{whose}: {name} is {words[:60]}; give numbers, in rows of one length.") from None
 
 
 def check_positive(whose: str, **values: Any) -> None:
-    """Raises `InputError` for numbers that are not above 0, or not finite; what is traced is not looked at."""
+    """Raise `InputError` for values that are not positive, or not finite. Tracers are not checked."""
     for name, value in values.items():
         if concrete(value) and not np.all((np.asarray(value) > 0) & np.isfinite(value)):
             raise InputError(f"{whose}: {name} is {shown(value)}; it must be a finite number above 0.")
 
 
 def shown(value: Any) -> str:
-    """A number with four digits, a short list of them, else shape and dtype; what is traced as JAX writes it."""
+    """The text of a value: up to six numbers with four digits, a larger array by dtype and shape, a tracer as JAX
+    writes it."""
     if isinstance(value, Tracer) or not isinstance(value, jax.Array | np.ndarray | np.generic):
         return str(value)
     array = np.asarray(value)

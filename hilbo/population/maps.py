@@ -22,9 +22,9 @@ from jaxtyping import Array, Float, Int
 
 from hilbo.errors import InputError
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.numerics.rows import rows_of
-from hilbo.numerics.shown import known
+from hilbo.numerics.shown import has_values
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
@@ -84,7 +84,7 @@ class RuleMap(eqx.Module):
     def __repr__(self) -> str:
         people = (
             f", {self.experts.trials.mask.shape[0]} participants"
-            if self.experts is not None and known(self.experts.trials.mask)
+            if self.experts is not None and has_values(self.experts.trials.mask)
             else ""
         )
         return f"RuleMap({self.rule}, {self.method}{people})"
@@ -171,7 +171,7 @@ def rule_map(
     if rule not in GIVEN_RULES:
         raise InputError(f'rule_map: the rule is "{rule}"; it must be one of {", ".join(GIVEN_RULES)}.')
     prior = jnp.asarray(gp.kernel.variance)
-    one = placed(1.0, prior.dtype)
+    one = to_device(1.0, prior.dtype)
     if rule == "hierarchical":
         map_share = jnp.asarray(share_of(gp, trials, inference).mean if share is None else share, prior.dtype)
         shared = _shared_function(gp, trials, map_share, inference, largest)
@@ -225,7 +225,7 @@ def _among_all(counts: Counts, everybody: Counts, chosen: Int[np.ndarray, " k"])
         return counts
     rows = np.zeros(everybody.counts.shape, counts.counts.dtype)
     rows[chosen] = np.asarray(counts.counts)
-    return Counts(everybody.x, placed(rows))
+    return Counts(everybody.x, to_device(rows))
 
 
 def even_rows(trials: Trials, largest: int) -> Int[np.ndarray, " k"]:
@@ -280,7 +280,7 @@ def _shared_function(
 def _pooled(gp: OrdinalGP, trials: Trials, inference: str, largest: int) -> Posterior | None:
     """One GP on everybody's answers, as if from one person; None if they are too many."""
     counts = _counts_if_cheaper(gp, trials, inference)
-    one = placed(1.0, gp.kernel.variance.dtype)
+    one = to_device(1.0, gp.kernel.variance.dtype)
     posterior = _from_counts(gp, None if counts is None else one_person(counts), one, largest)
     mask = np.asarray(trials.mask)
     if posterior is not None or mask.sum() > largest:

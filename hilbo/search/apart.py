@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from hilbo.numerics.host import namespace_of, placed
+from hilbo.numerics.host import namespace_of, to_device
 from hilbo.search.box import Parameter
 
 __all__ = ["differences", "levels_of", "middle_of", "nrmse"]
@@ -42,7 +42,7 @@ def nrmse(x: Float[Any, "*#batch d"], y: Float[Any, "*#batch d"], levels: tuple[
     """Root-mean-square difference of parameter sets in units of their search ranges: of points of the unit cube, by
     `differences`. `x`, `y` (..., d) -> (...,)."""
     away = differences(levels, np.asarray(x), np.asarray(y))
-    return placed(np.sqrt(np.mean(away**2, axis=-1)))
+    return to_device(np.sqrt(np.mean(away**2, axis=-1)))
 
 
 def middle_of(levels: tuple[int, ...], x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " d"]:

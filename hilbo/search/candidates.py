@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Array, Float
 
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.search.space import SearchSpace
 
 __all__ = ["CANDIDATES", "search_points"]
@@ -17,4 +17,4 @@ def search_points(space: SearchSpace, seed: int, count: int = CANDIDATES) -> Flo
     on its walls, edges and corners.
     -> (`count` + `count` // 4, d).
     """
-    return placed(np.concatenate([space.candidates(count, seed), space.walls(count // 4, seed)]))
+    return to_device(np.concatenate([space.candidates(count, seed), space.walls(count // 4, seed)]))

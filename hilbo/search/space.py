@@ -27,7 +27,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
 from hilbo.errors import InputError
-from hilbo.numerics.host import floating, namespace_of, placed
+from hilbo.numerics.host import floating, namespace_of, to_device
 from hilbo.numerics.polytope import Polytope
 from hilbo.numerics.tracing import program
 from hilbo.search import linear
@@ -157,7 +157,7 @@ class SearchSpace(eqx.Module):
         self._check_axis(unit)
         points = floating(unit)
         xp = namespace_of(points)
-        return placed(xp.stack([p.to_physical(points[..., i]) for i, p in enumerate(self.parameters)], axis=-1))
+        return to_device(xp.stack([p.to_physical(points[..., i]) for i, p in enumerate(self.parameters)], axis=-1))
 
     def from_box(self, w: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
         """Optimiser's coordinates in [0, 1]^d to the unit cube; differentiable.
@@ -191,7 +191,7 @@ class SearchSpace(eqx.Module):
         points = floating(x) if plain else _on_device(x)
         inside = namespace_of(points).all((points >= 0) & (points <= 1), axis=-1)
         if plain:
-            return placed(inside)
+            return to_device(inside)
         physical = self.to_physical(points)
         if self.mechanics is not None:
             inside &= allowed(self.mechanics, self._split(physical))
@@ -273,7 +273,7 @@ class SearchSpace(eqx.Module):
 
 
 def _on_device(x: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
-    return placed(x, jnp.result_type(1.0, x))
+    return to_device(x, jnp.result_type(1.0, x))
 
 
 @functools.lru_cache(maxsize=16)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hilbo.simulation import simulate
-from hilbo.simulation.presets import placed, population_of
+from hilbo.simulation.presets import population_of, with_truth
 from hilbo.simulation.simulate import Population
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
@@ -35,7 +35,7 @@ def simulate_folder(folder: Path, preset: str | None, count: int, seed: int, sou
     """
     path = Path(str(files("hilbo") / "data" / "paper.toml")) if source is None else source
     study = Study.load(path)
-    population = placed(study, population_of(study, preset)[1], seed)
+    population = with_truth(study, population_of(study, preset)[1], seed)
     people = simulate.people(study, population, count, seed)
     table = simulate.to_table(study, simulate.simulate_study(study, people, seed))
     write_trials(table, folder / "trials.csv")

@@ -34,7 +34,7 @@ from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map
 from hilbo.search.apart import differences
 from hilbo.search.candidates import search_points
-from hilbo.simulation.presets import placed
+from hilbo.simulation.presets import with_truth
 from hilbo.simulation.simulate import Person, Population, felt_apart, people, simulate_study
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
@@ -143,7 +143,7 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
     staged = _with_trials(study, longest)
     # A drift over the study's own session, told per trial, is this much over the longest one.
     scale = longest / study.selection.trials
-    population_ = placed(study, population_, seed)
+    population_ = with_truth(study, population_, seed)
     persons = people(staged, population_, most, seed)
     persons = eqx.tree_at(lambda p: p.drift, persons, persons.drift * scale)
     trials = simulate_study(staged, persons, seed)

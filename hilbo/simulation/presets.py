@@ -16,7 +16,7 @@ from hilbo.simulation.simulate import Population
 from hilbo.study.config import Study
 from hilbo.study.file.simulated_people import SimulationTable, each
 
-__all__ = ["PRESETS", "placed", "population_of", "preset_of"]
+__all__ = ["PRESETS", "population_of", "preset_of", "with_truth"]
 
 _STEP = 1.5  # from one criterion to the next, in tolerances, where a study states none
 
@@ -46,7 +46,7 @@ def population_of(study: Study, preset: str | None = None) -> tuple[str, Populat
     """What a study's simulated people are called, and the population that they are drawn from: the preset if one is
     asked for, else the study's [simulation], else `paper` for a study like the paper's, else that table's defaults.
 
-    Its truth may be missing: see `placed`. Raises InputError for a preset that there is not or of other parameters."""
+    Its truth may be missing: see `with_truth`. Raises InputError for a preset that there is not or of other parameters."""
     paper = PRESETS["paper"]
     fits = _of_these_ranges(study, paper) and len(study.responses) == 1 + len(paper.criteria)
     if preset is None and not (study.simulation is None and fits):
@@ -89,7 +89,7 @@ def _stated(study: Study, table: SimulationTable) -> Population:
     )
 
 
-def placed(study: Study, population: Population, seed: int) -> Population:
+def with_truth(study: Study, population: Population, seed: int) -> Population:
     """The population with its truth; where it states none, with one drawn evenly from what may be rendered."""
     if population.truth:
         return population

@@ -12,9 +12,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from hilbo.errors import InputError
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.numerics.rows import rows_of
-from hilbo.numerics.shown import known
+from hilbo.numerics.shown import has_values
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
 from hilbo.population.learnt.recipes import RECIPES
@@ -46,7 +46,7 @@ class Cohort(eqx.Module):
     """and their names."""
 
     def __repr__(self) -> str:
-        if not known(self.trials.x, self.trials.mask):
+        if not has_values(self.trials.x, self.trials.mask):
             return eqx.tree_pformat(self)
         few = ", ".join(self.names[:6]) + (", ..." if len(self.names) > 6 else "")
         answers, dim = int(np.sum(self.trials.mask)), self.trials.x.shape[-1]
@@ -57,7 +57,7 @@ class Cohort(eqx.Module):
         if count < 1:
             raise InputError(f"Cohort: asked for everybody's first {count} trials; give a number from 1.")
         mask = np.asarray(self.trials.mask) & (np.arange(self.trials.mask.shape[1]) < count)[None, :]
-        return dataclasses.replace(self, trials=eqx.tree_at(lambda t: t.mask, self.trials, placed(mask)))
+        return dataclasses.replace(self, trials=eqx.tree_at(lambda t: t.mask, self.trials, to_device(mask)))
 
     def of(self, names: Sequence[str]) -> "Cohort":
         """Only these participants. Raises `InputError` for a name that the table does not have, or that comes twice."""
@@ -115,11 +115,11 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     asked = _asked(table.iloc[order], rows, held.shape)
     texts = _random_effect(table, study)
     if texts is None:
-        return Cohort(jax.vmap(Trials)(x, placed(answers), placed(held)), physical, tuple(names), (), *asked)
+        return Cohort(jax.vmap(Trials)(x, to_device(answers), to_device(held)), physical, tuple(names), (), *asked)
     levels, contexts = pd.factorize(texts, sort=True)
     context = np.zeros((len(counts), capacity), np.int32)
     context[rows] = levels[order]
-    trials = jax.vmap(Trials)(x, placed(answers), placed(held), placed(context))
+    trials = jax.vmap(Trials)(x, to_device(answers), to_device(held), to_device(context))
     return Cohort(trials, physical, tuple(names), tuple(contexts), *asked)
 
 

@@ -12,7 +12,7 @@ from commands import run
 import hilbo
 from hilbo.errors import InputError
 from hilbo.simulation import simulate
-from hilbo.simulation.presets import PRESETS, placed, population_of, preset_of
+from hilbo.simulation.presets import PRESETS, population_of, preset_of, with_truth
 from hilbo.study.config import Study
 
 THIRTY = [f"paper-{k:02d}" for k in range(1, 31)]
@@ -58,9 +58,9 @@ def test_any_study_has_people():
     study = Study.from_dict(tomllib.loads(VISUAL))
     name, population = population_of(study)
     assert "no preset" in name and len(population.criteria) == 3 and not population.truth
-    truths = [placed(study, population, seed).truth for seed in (0, 0, 1)]
+    truths = [with_truth(study, population, seed).truth for seed in (0, 0, 1)]
     assert truths[0] == truths[1] != truths[2]
-    people = simulate.people(study, placed(study, population, 0), 400, 1)
+    people = simulate.people(study, with_truth(study, population, 0), 400, 1)
     near = study.space.to_unit(np.array([truths[0]["hue"], truths[0]["light"]]))
     assert np.all(np.abs(np.asarray(people.optimum).mean(axis=0) - near) < 0.15)
 
@@ -69,7 +69,7 @@ def test_a_study_may_state_its_people():
     study = Study.from_dict(tomllib.loads(VISUAL + STATED))
     name, population = population_of(study)
     assert "[simulation]" in name and population.spread == (0.02, 0.03) and population.tolerance == (0.2, 0.2)
-    assert placed(study, population, 5).truth == {"hue": 90, "light": 65}
+    assert with_truth(study, population, 5).truth == {"hue": 90, "light": 65}
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_people_of_other_ranges_are_not_the_papers():
     raw["parameters"]["B1"] |= {"low": 0.15, "high": 2.0}
     narrow = Study.from_dict(raw)
     name, population = population_of(narrow)
-    assert "no preset" in name and 0.15 <= placed(narrow, population, 0).truth["B1"] <= 2.0
+    assert "no preset" in name and 0.15 <= with_truth(narrow, population, 0).truth["B1"] <= 2.0
     with pytest.raises(InputError, match=r"like .*B1 = 5.89.*B1 from 0.15 to 2.* leave --preset out"):
         population_of(narrow, "paper-03")
 

@@ -28,7 +28,7 @@ from hilbo.search.apart import levels_of, nrmse
 from hilbo.session.log.event_log import read_log
 from hilbo.session.plan.plan import make_plan
 from hilbo.simulation import simulate
-from hilbo.simulation.presets import placed, population_of
+from hilbo.simulation.presets import population_of, with_truth
 from hilbo.simulation.simulate import Population
 from hilbo.study.config import Study
 
@@ -159,7 +159,7 @@ def rehearse(
     study = Study.load(file)
     material = next(iter(study.materials), None)
     here = study if material is None else study.material(material)
-    population = placed(here, population_of(here, preset)[1], seed)
+    population = with_truth(here, population_of(here, preset)[1], seed)
     arguments = [str(file), "--participant", "P01", "--logs", str(out / "logs"), "--port", "0"]
     arguments += ["--dry-run", "--gap", "0.7" if seconds is None else "0.05"]
     if phase != "optimisation":

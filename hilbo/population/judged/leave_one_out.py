@@ -26,7 +26,7 @@ from scipy.special import ndtri
 
 from hilbo.errors import InputError
 from hilbo.kernels import gram
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.numerics.rows import rows_of
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
@@ -140,7 +140,7 @@ def left_out_by(
         maps.append(map_without)
         for person in group:
             context = None if trials.context is None else trials.context[person]
-            answers = placed(x[person]), trials.q[person], trials.mask[person], context
+            answers = to_device(x[person]), trials.q[person], trials.mask[person], context
             for part, values in zip((rows, logs), _newcomer(gp, map_without, *answers), strict=True):
                 part.append(np.asarray(values)[mask[person]])
             persons.append(np.full(mask[person].sum(), person))

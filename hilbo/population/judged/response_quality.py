@@ -38,7 +38,7 @@ from scipy.stats import binomtest, chi2
 
 from hilbo.errors import InputError
 from hilbo.kernels import Kernel, gram
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Trials
 from hilbo.population.newcomer import in_turn
@@ -117,8 +117,8 @@ def _evenly(trials: Trials) -> Trials:
     for j, (given, part) in enumerate(zip(map(np.flatnonzero, mask), held, strict=True)):
         rows[j, part] = given[np.linspace(0, len(given) - 1, part.sum()).round().astype(int)]
     person = np.arange(len(mask))[:, None]
-    x, q = (placed(np.asarray(leaf)[person, rows]) for leaf in (trials.x, trials.q))
-    return jax.vmap(Trials)(x, q, placed(held))
+    x, q = (to_device(np.asarray(leaf)[person, rows]) for leaf in (trials.x, trials.q))
+    return jax.vmap(Trials)(x, q, to_device(held))
 
 
 @program

@@ -31,7 +31,7 @@ from hilbo.errors import InputError
 from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
 from hilbo.kernels import gram
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.shared.tallies import Expansion, expand_counts
@@ -68,7 +68,7 @@ def counts_of(trials: Trials, categories: int) -> Counts:
     person = np.broadcast_to(np.arange(len(mask))[:, None], mask.shape)[mask]
     counts = np.zeros((len(mask), len(points), categories), points.dtype)
     np.add.at(counts, (person, place.reshape(-1), q), 1.0)
-    return Counts(placed(points), placed(counts))
+    return Counts(to_device(points), to_device(counts))
 
 
 def one_person(answers: Counts) -> Counts:
@@ -77,7 +77,7 @@ def one_person(answers: Counts) -> Counts:
     counts = np.asarray(answers.counts)
     pooled = np.zeros_like(counts)
     pooled[0] = counts.sum(axis=0)
-    return Counts(answers.x, placed(pooled))
+    return Counts(answers.x, to_device(pooled))
 
 
 @program

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
 from hilbo.kernels import Kernel
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 
@@ -93,7 +93,7 @@ class Share(eqx.Module):
         """
         shares, logs = np.asarray(self.shares), np.asarray(self.log_evidence)
         top = logs.max()
-        return placed(top + np.log(np.trapezoid(np.exp(logs - top), dx=shares[1] - shares[0])) - logs[-1])
+        return to_device(top + np.log(np.trapezoid(np.exp(logs - top), dx=shares[1] - shares[0])) - logs[-1])
 
 
 def of_people(trials: Trials) -> Trials:
@@ -155,7 +155,7 @@ def share_from(evidence: Callable[[Float[Array, ""]], tuple[Any, Any]], dtype: D
     evaluated: dict[int, tuple[float, bool]] = {}  # by place among the finest nodes, in which the coarser ones are
     for step in (4, 2, 1):
         for node in (i for i in range(0, _NODES, step) if i not in evaluated):
-            value, held = evidence(placed((1 + _nodes()[node]) / 2, dtype))
+            value, held = evidence(to_device((1 + _nodes()[node]) / 2, dtype))
             evaluated[node] = float(value), bool(held)
         every = sorted(evaluated)
         fitted = np.array([evaluated[i][0] for i in every])
@@ -168,13 +168,13 @@ def share_from(evidence: Callable[[Float[Array, ""]], tuple[Any, Any]], dtype: D
     weight = np.exp(curve - curve.max())
     area = np.concatenate([[0.0], np.cumsum((weight[1:] + weight[:-1]) / 2)])
     return Share(
-        shares=placed(grid),
-        log_evidence=placed(curve),
-        best=placed(grid[curve.argmax()]),
-        mean=placed(np.trapezoid(weight * grid) / np.trapezoid(weight)),
-        interval=placed(np.interp([0.025, 0.975], area / area[-1], grid)),
-        interpolation_error=placed(error),
-        converged=placed(error < _USABLE and all(good for _, good in evaluated.values())),
+        shares=to_device(grid),
+        log_evidence=to_device(curve),
+        best=to_device(grid[curve.argmax()]),
+        mean=to_device(np.trapezoid(weight * grid) / np.trapezoid(weight)),
+        interval=to_device(np.interp([0.025, 0.975], area / area[-1], grid)),
+        interpolation_error=to_device(error),
+        converged=to_device(error < _USABLE and all(good for _, good in evaluated.values())),
     )
 
 

@@ -17,7 +17,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.report.figures.answers import answer_handles, mark_along, mark_trials
 from hilbo.report.figures.style import (
     BLUE,
@@ -233,14 +233,14 @@ def grid_slice(study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], 
         x[..., 2] = third
     flat = x.reshape(-1, x.shape[-1])
     feasible = np.asarray(study.space.feasible(flat))
-    mean, variance = (np.where(feasible, np.asarray(m), np.nan).reshape(x.shape[:-1]) for m in surface(placed(flat)))
+    mean, variance = (np.where(feasible, np.asarray(m), np.nan).reshape(x.shape[:-1]) for m in surface(to_device(flat)))
     return Slice(mean, np.sqrt(variance))
 
 
 def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Physical values, mean and standard deviation of a map of one parameter."""
     side = np.asarray(study.space.parameters[0].axis(_CELLS))
-    mean, variance = surface(placed(side[:, None]))
+    mean, variance = surface(to_device(side[:, None]))
     return np.asarray(study.space.parameters[0].to_physical(side)), np.asarray(mean), np.sqrt(np.asarray(variance))
 
 

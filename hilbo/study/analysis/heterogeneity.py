@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED
 from hilbo.population.maps import RuleMap
 from hilbo.population.pointwise import RULES
@@ -69,5 +69,5 @@ def _sd_ratio(aggregate: Any) -> float | None:
     """The hierarchical map's standard deviation over the map's, at the optimum."""
     if aggregate.hierarchical is None:
         return None
-    _, variance = predict_map(aggregate.hierarchical, placed(np.asarray(aggregate.optimum.x)[None, :]))
+    _, variance = predict_map(aggregate.hierarchical, to_device(np.asarray(aggregate.optimum.x)[None, :]))
     return math.sqrt(float(np.asarray(variance)[0])) / float(aggregate.optimum.sd)

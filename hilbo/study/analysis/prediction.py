@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
-from hilbo.numerics.shown import known
+from hilbo.numerics.shown import has_values
 from hilbo.ordinal_gp import Posterior
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate
@@ -31,7 +31,7 @@ def predict_table(study: Study, model: Posterior | Aggregate, table: pd.DataFram
     """
     x = _points(study, table)
     if isinstance(model, Posterior):
-        if not known(model.trials.mask) or model.trials.mask.ndim != 1:
+        if not has_values(model.trials.mask) or model.trials.mask.ndim != 1:
             raise InputError("predict_table: the posterior holds several people; give one of them, or the Aggregate.")
         mean, variance = model.predict(x)
         chances = model.class_probabilities(x)

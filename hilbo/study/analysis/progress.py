@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.maps import RuleMap, point_rule
@@ -94,7 +94,7 @@ def follow(study: Study, aggregated: Aggregate, seed: int = 0, counts: Sequence[
     candidates = search_points(study.space, seed)
 
     split = _splits(len(cohort.names), seed)
-    points = placed(np.asarray(candidates)[:_POINTS])
+    points = to_device(np.asarray(candidates)[:_POINTS])
 
     def after(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, RuleMap | None]:
         last = count == longest
@@ -131,7 +131,7 @@ def _tops(map_: RuleMap, points: Float[Array, "m d"], split: Bool[np.ndarray, "s
     if not len(split):
         return np.zeros((0, 2), int)
     sides = np.stack([split, ~split], axis=1).reshape(-1, split.shape[1])
-    return np.asarray(_highest(map_, points, placed(sides))).reshape(-1, 2)
+    return np.asarray(_highest(map_, points, to_device(sides))).reshape(-1, 2)
 
 
 @program
@@ -169,7 +169,7 @@ def _map_by_points(study: Study, share: Float[Array, ""], posteriors: Posterior)
     rule, rule_share = point_rule(study.rule, share)
     prior = jnp.asarray(study.gp.kernel.variance)
     return RuleMap(
-        rule, "by points", posteriors, None, placed(1.0, prior.dtype) if rule_share is None else rule_share, prior
+        rule, "by points", posteriors, None, to_device(1.0, prior.dtype) if rule_share is None else rule_share, prior
     )
 
 

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 
 from hilbo.errors import InputError
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.numerics.host import placed
-from hilbo.numerics.shown import known
+from hilbo.numerics.host import to_device
+from hilbo.numerics.shown import has_values
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population.learnt.recipes import RECIPES
@@ -61,7 +61,7 @@ class Aggregate(eqx.Module):
     """What the answers say of how people differ; None if it was not asked, or fewer than two people answered."""
 
     def __repr__(self) -> str:
-        if not known(self.optimum.x):
+        if not has_values(self.optimum.x):
             return eqx.tree_pformat(self)
         return f"Aggregate({self.cohort!r}; {self.map!r}; {self.optimum!r})"
 
@@ -88,7 +88,7 @@ class Aggregate(eqx.Module):
 
     def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the population map at points of the unit cube."""
-        return predict_map(self.map, placed(x))
+        return predict_map(self.map, to_device(x))
 
     def class_probabilities(self, likelihood: OrdinalProbit, x: Float[ArrayLike, "m d"]) -> Float[Array, "m C"]:
         """Probabilities (m, C) of a new person's answers at points of the unit cube."""
@@ -104,7 +104,7 @@ class Aggregate(eqx.Module):
     def mean_of_optima(self) -> Float[Array, " d"]:
         """Plain average of the individuals' optima in the unit cube, of levels the commonest: what the paper compares
         the map with. (d,)."""
-        return placed(middle_of(self.posteriors.gp.kernel.levels, np.asarray(self.individuals.x)))
+        return to_device(middle_of(self.posteriors.gp.kernel.levels, np.asarray(self.individuals.x)))
 
 
 def fit_cohort(
@@ -217,4 +217,4 @@ def asked_variance(map_: RuleMap, cohort: Cohort) -> Float[Array, ""]:
     if map_.reach is not None:
         return map_.reach
     points = np.unique(np.asarray(cohort.trials.x)[np.asarray(cohort.trials.mask)], axis=0)
-    return placed(np.asarray(predict_map(map_, placed(points))[1]).max())
+    return to_device(np.asarray(predict_map(map_, to_device(points))[1]).max())

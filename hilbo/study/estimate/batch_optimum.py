@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.errors import InputError
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
 from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.maps import RuleMap, learnt_map, share_of
@@ -69,7 +69,7 @@ class LargeAggregate(eqx.Module):
         """Mean and variance (m,) of the population map at points of the unit cube; of a map that is a sum over people
         by a pass of the whole crew."""
         if self.map is not None:
-            mean, variance = predict_map(self.map, placed(x))
+            mean, variance = predict_map(self.map, to_device(x))
             return np.asarray(mean), np.asarray(variance)
         study = self.population.study
         prior = np.asarray(jax.vmap(study.gp.kernel.diagonal)(jnp.asarray(x)))
@@ -83,7 +83,7 @@ class LargeAggregate(eqx.Module):
         if self.individuals is None:
             return None
         levels = self.population.study.gp.kernel.levels
-        return placed(middle_of(levels, np.asarray(self.individuals.x)))
+        return to_device(middle_of(levels, np.asarray(self.individuals.x)))
 
 
 def aggregate_population(
@@ -134,7 +134,7 @@ def _that_learns(
     other rules beside it by passes over people."""
     assert study.learnt is not None
     map_ = learnt_map(study.learnt, cohort.trials)
-    optimum = map_optimum(study, map_, placed(candidates))
+    optimum = map_optimum(study, map_, to_device(candidates))
     people = dataclasses.replace(study, learnt=None)  # of which each program needs the model alone
     population = streamed_cohort(people, cohort, crew) if say is None else streamed_cohort(people, cohort, crew, say)
     fitted = refit(population, candidates, individuals)

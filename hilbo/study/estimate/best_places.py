@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from hilbo.kernels import RBF, Stationary
-from hilbo.numerics.host import placed
+from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.joint import posterior_map
@@ -47,7 +47,7 @@ def best_places(
     many on the walls."""
     points, each = search_points(space, seed, count), -(-draws // len(functions))
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
-        seeds = map(placed, range(seed, seed + len(functions)))
+        seeds = map(to_device, range(seed, seed + len(functions)))
         shares = list(pool.map(lambda function, seed: _shares(function, points, seed, each), functions, seeds))
     return BestPlaces(points, sum(shares[1:], shares[0]) / len(shares))
 
