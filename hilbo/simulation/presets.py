@@ -46,7 +46,8 @@ def population_of(study: Study, preset: str | None = None) -> tuple[str, Populat
     """What a study's simulated people are called, and the population that they are drawn from: the preset if one is
     asked for, else the study's [simulation], else `paper` for a study like the paper's, else that table's defaults.
 
-    Its truth may be missing: see `with_truth`. Raises InputError for a preset that there is not or of other parameters."""
+    Its truth may be missing: see `with_truth`. Raises `InputError` for an unknown preset, and for one of other
+    parameters."""
     paper = PRESETS["paper"]
     fits = _of_these_ranges(study, paper) and len(study.responses) == 1 + len(paper.criteria)
     if preset is None and not (study.simulation is None and fits):
