@@ -426,3 +426,83 @@ def test_keys_are_shown_where_there_is_a_keyboard(tmp_path):
         assert not tablet.is_visible("#go kbd")
         tablet.keyboard.press("Shift")
         assert tablet.is_visible("#go kbd")
+
+
+def french(window, key, code):
+    """A key of a French keyboard: the character that it gives, and its place."""
+    until(window, "performance.now() - laidOut > SETTLES")
+    window.evaluate(f"document.dispatchEvent(new KeyboardEvent('keydown', {{key: {key!r}, code: {code!r}}}))")
+
+
+@pytest.mark.parametrize("pages", [SINGLES], indirect=True, ids=["one rendering"])
+def test_answers_by_the_places_of_a_french_keyboard(pages):
+    live, participant, _ = pages
+    until_answered(participant, 1)
+    until_logged(live, participant.window, 1)
+    window = participant.window
+    window.wait_for_selector("#options:visible")
+    for key, code in [("End", "Numpad1"), ("a", "KeyQ"), ("Dead", "Digit2")]:
+        french(window, key, code)
+    window.wait_for_timeout(300)
+    assert len(live.events("answer")) == 1
+    french(window, "é", "Digit2")
+    until_logged(live, window, 2)
+    assert live.events("answer")[-1].data["values"] == {"class_a": "similar"}
+
+
+OLD = "delete AbortSignal.timeout; delete Array.prototype.at; delete CanvasRenderingContext2D.prototype.roundRect;"
+BLOCKED = """for (const name of ["localStorage", "sessionStorage"]) Object.defineProperty(window, name, {
+  get() { throw new DOMException("The operation is insecure.", "SecurityError"); },
+});"""
+MISSING = "delete window.AbortController;"
+
+
+def test_a_session_in_a_browser_of_some_years_ago(tmp_path):
+    with Live(tmp_path, seconds=0.1, blocks=SINGLES) as live, browser() as program:
+        links, windows = live.place.links(), {}
+        for role in ("experimenter", "participant"):
+            context = program.new_context()
+            context.add_init_script(OLD)
+            windows[role] = context.new_page()
+        windows["experimenter"].goto(links["experimenter"])
+        windows["experimenter"].wait_for_url("**/experimenter")
+
+        def watch():
+            return windows["experimenter"].evaluate("fetch('/api/experimenter').then(r => r.json())")
+
+        participant = Participant(windows["participant"], links["participant"], watch, lambda _, ask: "close")
+        until_answered(participant, 2)
+        until_logged(live, windows["participant"], 2)
+        assert windows["participant"].evaluate("typeof AbortSignal.timeout") == "undefined"
+
+
+@pytest.mark.parametrize(
+    ("script", "sentence"),
+    [(BLOCKED, "lets the page store nothing"), (MISSING, "too old")],
+    ids=["storage is blocked", "a part is missing"],
+)
+@pytest.mark.parametrize("role", ["participant", "experimenter"])
+def test_a_page_that_cannot_work_says_why_and_its_link_stays_good(tmp_path, role, script, sentence):
+    with Live(tmp_path, seconds=0.1) as live, browser() as program:
+        link = live.place.links()[role]
+        context = program.new_context()
+        context.add_init_script(script)
+        window = context.new_page()
+        window.goto(link)
+        window.wait_for_selector("[role=alert]:visible")
+        assert sentence in window.inner_text("body")
+        good = program.new_context().new_page()
+        good.goto(link)
+        good.wait_for_url(f"**/{role}")
+
+
+@pytest.mark.parametrize("role", ["participant", "experimenter"])
+def test_a_browser_that_cannot_read_a_script_says_so(tmp_path, role):
+    with Live(tmp_path, seconds=0.1) as live, browser() as program:
+        window = program.new_context().new_page()
+        window.route(
+            f"**/static/{role}.js", lambda route: route.fulfill(body="let = ;", content_type="text/javascript")
+        )
+        window.goto(live.place.links()[role])
+        window.wait_for_selector("[role=alert]:visible")
+        assert "too old for this page" in window.inner_text("body")

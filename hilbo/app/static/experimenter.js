@@ -1,5 +1,6 @@
 // The experimenter's page: everything the server knows, and the commands. Nothing is decided here.
 "use strict";
+if (refusal) throw new Error(refusal);
 
 const at = (id) => document.getElementById(id);
 const put = (id, text) => { if (at(id).textContent !== text) at(id).textContent = text; };

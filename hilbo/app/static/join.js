@@ -1,6 +1,7 @@
 // Trades the one-time token behind the # of the link for the cookie of its role, then goes to that role's page.
 "use strict";
 (async () => {
+  if (refusal) return;
   const title = document.getElementById("title"), texts = title.dataset;
   const token = location.hash.slice(1);
   history.replaceState(null, "", "/");

@@ -3,6 +3,7 @@
 // An answer is kept in localStorage from the click to the server's acknowledgement, and sent again, the same bytes, after
 // every failure and at every new start of the page; the server takes it once, by trial and client.
 "use strict";
+if (refusal) throw new Error(refusal);
 
 const KEPT = "hilbo.answer", CLIENT = "hilbo.client";
 const at = (id) => document.getElementById(id);
@@ -122,7 +123,7 @@ async function hand() {
   try {
     const reply = await fetch("/api/participant/answer", {
       method: "POST", headers: { "Content-Type": "application/json", "X-Hilbo-Page": page }, body,
-      signal: AbortSignal.timeout(15000),
+      signal: timeout(15000),
     });
     // Taken, or settled otherwise: a refused one (4xx) is of a trial that is over, and the server has logged that.
     if (reply.ok || (reply.status >= 400 && reply.status < 500 && reply.status !== 429)) {
@@ -143,7 +144,7 @@ async function press(what) {
   try {
     const reply = await fetch(`/api/participant/${what}`, {
       method: "POST", headers: { "Content-Type": "application/json", "X-Hilbo-Page": page },
-      body: JSON.stringify({ trial }), signal: AbortSignal.timeout(15000),
+      body: JSON.stringify({ trial }), signal: timeout(15000),
     });
     const news = await reply.json().catch(() => null);
     if (news && news.view) receive(news.view);
@@ -176,7 +177,7 @@ async function here() {
   try {
     await fetch("/api/participant/here", {
       method: "POST", headers: { "Content-Type": "application/json", "X-Hilbo-Page": page }, body: "{}",
-      signal: AbortSignal.timeout(2500),
+      signal: timeout(2500),
     });
     if (silent && !over) { silent = false; listen(); }
   } catch { silent = true; connected = false; source.close(); draw(); }
@@ -195,7 +196,7 @@ function tick() {
 document.addEventListener("keydown", (e) => {
   if (e.repeat || e.ctrlKey || e.altKey || e.metaKey) return;
   document.body.classList.add("keys");
-  if (/^[1-9]$/.test(e.key)) { choose(Number(e.key) - 1); e.preventDefault(); }
+  if (digit(e)) { choose(digit(e) - 1); e.preventDefault(); }
   else if ((e.key === " " || e.key === "Enter") && !at("go").hidden && !(e.target instanceof HTMLButtonElement)) {
     go(); e.preventDefault();
   }

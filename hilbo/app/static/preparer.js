@@ -3,6 +3,7 @@
 // The page gives signs of life and is told the newest order by the same messages as a program that presents
 // (docs/guides/stimulus.md). Nothing is confirmed but by a button.
 "use strict";
+if (refusal) throw new Error(refusal);
 
 const at = (id) => document.getElementById(id);
 const put = (id, text) => { if (at(id).textContent !== text) at(id).textContent = text; };
@@ -18,7 +19,7 @@ let asking = false;                  // what is in the way
 async function post(path, content) {
   const reply = await fetch(path, {
     method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content),
-    signal: AbortSignal.timeout(1000 * silence),
+    signal: timeout(1000 * silence),
   });
   return [reply.status, await reply.json()];
 }

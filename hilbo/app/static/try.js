@@ -13,7 +13,7 @@
 function exponentials(table, alpha) {
   // Weights, and losses 1 - lambda, of the memory of order alpha: hilbo.mechanics.exponentials, whose table this is.
   const x = 2 * alpha - 1, basis = [1, x];
-  while (basis.length < table[0].length) basis.push(2 * x * basis.at(-1) - basis.at(-2));
+  while (basis.length < table[0].length) basis.push(2 * x * basis[basis.length - 1] - basis[basis.length - 2]);
   const values = table.map((row) => row.reduce((sum, c, i) => sum + c * basis[i], 0));
   const half = values.length / 2, rates = values.slice(0, half).map(Math.exp);
   rates[half - 1] *= alpha;
@@ -68,7 +68,7 @@ async function ask(path, body, bearer) {
   const headers = { "Content-Type": "application/json", "X-Hilbo-Page": page };
   if (bearer) headers.Authorization = `Bearer ${state.key}`;
   const what = body === undefined ? {} : { method: "POST", body: JSON.stringify(body) };
-  const reply = await fetch(path, { ...what, headers, signal: AbortSignal.timeout(15000) });
+  const reply = await fetch(path, { ...what, headers, signal: timeout(15000) });
   return { status: reply.status, ok: reply.ok, said: await reply.json().catch(() => ({})) };
 }
 
@@ -240,7 +240,8 @@ function drawBlock(c, x, size, depth, name, ink, fill) {
   c.globalAlpha = 1;
   drawRuler(c, left, size, ink);
   const foot = size.top + sink, head = foot - 46;
-  c.fillStyle = "#4a5663"; c.beginPath(); c.roundRect(x - punch, head, 2 * punch, 46, [4, 4, 9, 9]); c.fill();
+  c.fillStyle = c.strokeStyle = "#4a5663"; c.lineWidth = 8;          // a stroke that joins round makes the corners round
+  c.beginPath(); c.rect(x - punch + 4, head + 4, 2 * punch - 8, 38); c.fill(); c.stroke();
   const long = state.force / MOST * (size.top - 62);
   if (long > 1) {
     c.strokeStyle = c.fillStyle = "#a3161c"; c.lineWidth = 5;
@@ -297,7 +298,7 @@ async function main() {
   document.querySelectorAll("#answers button").forEach((b, i) => b.addEventListener("click", () => answer(i)));
   addEventListener("keydown", (e) => {
     if (e.repeat || e.ctrlKey || e.altKey || e.metaKey) return;
-    if (/^[123]$/.test(e.key)) { answer(Number(e.key) - 1); e.preventDefault(); }
+    if (digit(e) >= 1 && digit(e) <= 3) { answer(digit(e) - 1); e.preventDefault(); }
     else if (e.key === " " && at("card").hidden) { if (state.blocks) state.wanted = KEY; e.preventDefault(); }
   });
   addEventListener("keyup", (e) => { if (e.key === " ") release(); });
@@ -306,4 +307,4 @@ async function main() {
   requestAnimationFrame((now) => { state.then = now; frame(now); });
 }
 
-if (typeof document !== "undefined") main();
+if (typeof document !== "undefined" && !refusal) main();

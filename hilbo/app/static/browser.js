@@ -1,0 +1,42 @@
+// What every page needs of a browser: a page that cannot work says why, in place of staying blank.
+//
+// Minimum (docs/guides/live.md): Chrome and Edge 86, Firefox 98, Safari 15.4. This file is written for older ones, which
+// cannot read the scripts that follow.
+"use strict";
+
+var refusal = "";                     // why the page does not run; the scripts that follow do nothing then
+
+function refusePage(sentence) {
+  refusal = sentence;
+  document.body.textContent = sentence;
+  document.body.className = "refusal";
+  document.body.setAttribute("role", "alert");
+}
+
+// Of the scripts that follow, a browser that is too old reports a syntax error; what is missing otherwise is looked for.
+var TOO_OLD = "This browser is too old for this page. Use Chrome or Edge 86, Firefox 98, Safari 15.4, or a newer version.";
+window.addEventListener("error", function (e) { if (e.error instanceof SyntaxError) refusePage(TOO_OLD); });
+if (!window.fetch || !window.EventSource || !window.AbortController || !window.crypto || !document.body.replaceChildren) {
+  refusePage(TOO_OLD);
+}
+try {
+  localStorage.setItem("hilbo.check", "1");
+  localStorage.removeItem("hilbo.check");
+  sessionStorage.getItem("hilbo.check");
+} catch (error) {
+  refusePage("This browser lets the page store nothing, so that an answer could be lost. Allow cookies and site data for "
+    + location.host + ", then load the page again.");
+}
+
+// The signal of a request that is given up after so many milliseconds.
+function timeout(milliseconds) {
+  var controller = new AbortController();
+  setTimeout(function () { controller.abort(); }, milliseconds);
+  return controller.signal;
+}
+
+// The digit of a key by its place, 0 for another key: without Shift, the upper row of a French keyboard gives & é ".
+function digit(e) {
+  var found = e.key.length === 1 && (/^(?:Digit|Numpad)([1-9])$/.exec(e.code) || /^([1-9])$/.exec(e.key));
+  return found ? Number(found[1]) : 0;
+}
