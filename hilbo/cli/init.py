@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from hilbo.cli.terminal.new_file import check_free, new_file
+from hilbo.cli.terminal.new_file import check_free, write_new
 from hilbo.errors import InputError
 
 __all__ = ["init"]
@@ -51,6 +51,5 @@ def init(
     answers = tuple(text.strip() for text in responses.split(","))
     new = NewStudy(name or study.stem, parameters, answers, trials, device, by, tuple(constraint or ()))
     text = study_text(new)
-    with new_file(study) as path:
-        path.write_text(text, encoding="utf-8")
+    write_new(study, text, force)
     print(f"{study}: written; read it, then hilbo doctor {study}", file=sys.stderr)

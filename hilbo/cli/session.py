@@ -21,8 +21,9 @@ from hilbo.cli.terminal.console import (
     seed_option,
     start,
 )
-from hilbo.cli.terminal.new_file import check_free, new_file
+from hilbo.cli.terminal.new_file import check_free, write_new
 from hilbo.errors import InputError
+from hilbo.study.disk.lock import locked_folder
 
 __all__ = ["app_participants", "export", "plan"]
 
@@ -61,7 +62,8 @@ def plan(
     if register is not None:
         _check_register(register, out, reissue, force)
     if reissue is not None:
-        _write_plan(_reissued(out, study, file, reissue, results_ or []), out, as_json)
+        with locked_folder(out.resolve().parent):
+            _write_plan(_reissued(out, study, file, reissue, results_ or []), out, True, as_json)
         return
     check_choice("kind", kind, PHASES[1:])
     check_choice("source", source, ("aggregate", "individual"))
@@ -73,9 +75,9 @@ def plan(
     check_free(out, force)
     content = _plan_of(study, kind, source, people, materials, paths, trials, session, seed)
     check_free(out, force)  # it may have been made in the meantime
-    _write_plan(content, out, as_json)
+    _write_plan(content, out, force, as_json)
     if register is not None:
-        _write_registration(file, content, register)
+        _write_registration(file, content, register, force)
 
 
 def export(
@@ -300,19 +302,17 @@ def _check_register(register, out, reissue, force):
     check_free(register, force)
 
 
-def _write_registration(file, plan, out):
+def _write_registration(file, plan, out, force):
     from hilbo import __version__
     from hilbo.report.registration import registration
 
-    with new_file(out) as path:
-        path.write_text(registration(file, plan, __version__), encoding="utf-8")
+    write_new(out, registration(file, plan, __version__), force)
     typer.echo(f"{out}: read it, and fill in what is to be written by you", err=True)
 
 
-def _write_plan(plan, out, as_json):
+def _write_plan(plan, out, force, as_json):
     text = json.dumps(plan, indent=1, ensure_ascii=False) + "\n"
-    with new_file(out) as path:
-        path.write_text(text, encoding="utf-8")
+    write_new(out, text, force)
     complete = "complete blocks" if plan["complete"] else f"incomplete: balance is exact at {plan['complete_at']}"
     typer.echo(f"{out}: {len(plan['participants'])} participants, {complete}, hash {plan['hash']}", err=True)
     if as_json:

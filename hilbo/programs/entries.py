@@ -61,6 +61,7 @@ class Entries:
             if not _private(self.folder):
                 self._remark(f"{self.folder}: belongs to, or may be changed by, another user; nothing is kept there.")
                 return
+            # Not by hilbo.study.disk: what a power failure loses of a cache is made again, and is known by its digest.
             handle, name = tempfile.mkstemp(dir=self.folder)
             with os.fdopen(handle, "wb") as file:
                 file.write(hashlib.sha256(body).digest() + body)

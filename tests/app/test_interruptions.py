@@ -12,7 +12,7 @@ import pytest
 from live_server import PATIENCE, Live, ask, refused
 
 from hilbo.app.rehearsal.robot import Client
-from hilbo.app.wire import watchers
+from hilbo.app.wire import security, watchers
 from hilbo.session.log.records import Block, Planned
 
 
@@ -73,14 +73,18 @@ def test_a_full_disk_keeps_the_answer_unacknowledged_and_nothing_is_lost(live, m
     assert len(live.events("answer")) == 1
 
 
-def test_a_link_opened_on_a_full_disk_can_be_opened_again(live):
+def test_a_link_opened_on_a_full_disk_can_be_opened_again(live, monkeypatch):
     link = live.command("invite")["link"]
     token = link.partition("#")[2]
-    (live.folder / "keys.part").mkdir()  # nothing can be written there
-    with refused(503):
-        live.participant.post("/api/join", {"token": token})
+
+    def full(*_, **options):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(security, "write_file", full)
+        with refused(503):
+            live.participant.post("/api/join", {"token": token})
     assert live.view()["phase"]
-    (live.folder / "keys.part").rmdir()
     assert Client(link).get("/api/participant")["phase"]
 
 

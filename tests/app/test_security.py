@@ -1,5 +1,7 @@
 """Who gets in: one-time links, keys of two roles, and where a request may come from."""
 
+import errno
+import os
 import stat
 
 import pytest
@@ -88,14 +90,18 @@ def test_a_used_link_says_whom_it_let_in_until_another_did_and_after_a_restart(g
     assert again.let_in(first) is None and again.redeem(first, again=True) is None
 
 
-def test_a_link_that_could_not_be_opened_is_still_good_and_the_first_browser_stays(gate, tmp_path):
+def test_a_link_that_could_not_be_opened_is_still_good_and_the_first_browser_stays(gate, tmp_path, monkeypatch):
     _, first = gate.redeem(gate.invite("participant"))
     token = gate.invite("participant")
-    (tmp_path / "keys.part").mkdir()  # nothing can be written there
+
+    def full(*_, **options):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(InputError, match="make room"):
         gate.redeem(token)
+    monkeypatch.undo()
     assert gate.admits("participant", first)
-    (tmp_path / "keys.part").rmdir()
     _, second = gate.redeem(token)
     assert gate.admits("participant", second)
     assert not gate.admits("participant", first)

@@ -8,9 +8,9 @@ import time
 import pytest
 
 from hilbo.errors import InputError
-from hilbo.session.log import file_lock
 from hilbo.session.plan import participants
 from hilbo.session.plan.participants import add_person, check_consent, read_people
+from hilbo.study.disk.lock import locked_folder
 
 
 def person(name, consent="2026-05-04T10:15"):
@@ -37,8 +37,8 @@ def test_several_who_add_at_once_lose_nobody(tmp_path, monkeypatch):
 
 def test_a_list_that_another_holds_is_refused_after_a_while(tmp_path, monkeypatch):
     path = tmp_path / "participants.csv"
-    monkeypatch.setattr(participants, "locked_beside", lambda place: file_lock.locked_beside(place, 0.05))
-    with file_lock.locked_beside(path), pytest.raises(InputError, match="is being written by another hilbo"):
+    monkeypatch.setattr(participants, "locked_folder", lambda folder: locked_folder(folder, 0.05))
+    with locked_folder(tmp_path), pytest.raises(InputError, match="is being changed by another hilbo"):
         add_person(path, person("P01"))
     add_person(path, person("P01"))
 

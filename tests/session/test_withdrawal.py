@@ -12,7 +12,6 @@ from live import STUDY, Driver
 
 from hilbo.cli.terminal.console import results
 from hilbo.errors import InputError
-from hilbo.session.log import file_lock
 from hilbo.session.log.event_log import EventLog, log_name
 from hilbo.session.log.records import Block, Header, Planned
 from hilbo.session.plan.participants import read_people
@@ -20,6 +19,7 @@ from hilbo.session.plan.plan import make_plan, plan_hash, planned_header, reissu
 from hilbo.session.withdrawal import withdrawal
 from hilbo.session.withdrawal.results import command_without
 from hilbo.session.withdrawal.withdrawal import delete_participant
+from hilbo.study.disk.lock import locked_folder
 from hilbo.study.results.listing import list_files, listed
 from hilbo.study.tables.trials import read_trials
 from hilbo.study.tables.validation import read_validation, sets_frame
@@ -341,8 +341,8 @@ def test_a_number_is_an_id_where_ids_stand_alone(tmp_path):
 def test_a_list_that_somebody_is_added_to_is_waited_for(tmp_path, monkeypatch):
     path = tmp_path / "participants.csv"  # made by hand: nobody was added to it by hilbo
     path.write_text("participant,consent_time,protocol_number\nP01,2026-01-05,1\nP02,2026-01-05,1\n")
-    monkeypatch.setattr(withdrawal, "locked_beside", lambda place: file_lock.locked_beside(place, 0.05))
-    with file_lock.locked_beside(path), pytest.raises(InputError, match="is being written by another hilbo"):
+    monkeypatch.setattr(withdrawal, "locked_folder", lambda folder: locked_folder(folder, 0.05))
+    with locked_folder(tmp_path), pytest.raises(InputError, match="is being changed by another hilbo"):
         delete_participant(tmp_path, "P01")
     assert set(read_people(path)) == {"P01", "P02"}
     delete_participant(tmp_path, "P01")

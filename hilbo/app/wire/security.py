@@ -15,7 +15,6 @@ import hashlib
 import hmac
 import itertools
 import json
-import os
 import re
 import secrets
 import socket
@@ -24,6 +23,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from hilbo.errors import InputError
+from hilbo.study.disk.new_file import write_file
 
 __all__ = ["PAGES", "Gate", "Role", "lan_addresses"]
 
@@ -125,11 +125,8 @@ class Gate:
     def _keep(self, digests: Mapping[str, Mapping[Role, str]]) -> None:
         if self._file is None:
             return
-        part = self._file.with_name(f"{self._file.name}.part")
         try:
-            with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as file:
-                json.dump(digests, file)
-            part.replace(self._file)
+            write_file(self._file, json.dumps(digests), replace=True)
         except OSError as error:
             raise InputError(f"{self._file}: cannot be written ({error.strerror}); make room for it.") from error
 

@@ -156,7 +156,7 @@ def record(
         if render:
             _begin(device, wanted)
         device.samples(0.0)
-        with new_file(out) as path:
+        with new_file(out, force) as path:
             samples, ended = _recorded(device, seconds, path)
             if not samples:
                 raise ended or KeyboardInterrupt

@@ -11,7 +11,7 @@ import typer
 
 from hilbo.cli.device.options import Line, opened, takes
 from hilbo.cli.terminal.console import ForceFile, JsonToo, print_result, remark, seed_option
-from hilbo.cli.terminal.new_file import check_free, new_file
+from hilbo.cli.terminal.new_file import check_free, write_new
 from hilbo.errors import InputError
 
 __all__ = ["COMMANDS", "PHRASE"]
@@ -74,8 +74,7 @@ def commission(
         about, condition = device.device, device.condition()
         content = _content(result, about.damping_N_s_per_m, condition.delay_us)
         written = _header(device, content, base, text)
-    with new_file(out) as path:
-        path.write_text(written, encoding="utf-8")
+    write_new(out, written, force)
     for note in [*result.notes, *_differences(content)]:
         remark(note)
     print_result({"file": str(out)} | content, _words(out, content), as_json)

@@ -130,7 +130,7 @@ def characterise(
             table, ended = device_tests.characterise(device, say, **numbers, seed=seed), None
         except device_tests.CutShortError as error:
             table, ended = error.table, error
-    with new_file(out) as path:
+    with new_file(out, force) as path:
         table.to_csv(path, index=False)
     if ended is not None:
         raise DeviceError(f"{ended} {out} holds the {ended.repeats} repeats that are whole.")

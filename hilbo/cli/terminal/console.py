@@ -6,7 +6,6 @@ and nothing is overwritten without `--force`. Progress goes to stderr, results w
 
 import contextlib
 import gc
-import itertools
 import json
 import math
 import os
@@ -14,7 +13,6 @@ import shlex
 import shutil
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
@@ -127,38 +125,14 @@ def results(out: Path, force: bool) -> Iterator[Path]:
     """A new folder that becomes `out` when everything in it is complete; with a list of what it holds, so that
     `force` replaces nothing else later."""
     from hilbo.report.figures.painter import begin_painter
+    from hilbo.study.disk.new_folder import new_folder
     from hilbo.study.results.listing import list_files
 
     out = out.resolve()
-    _check_free(out, force)
-    begin_painter()
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        made = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
-    try:
-        with orderly():
-            yield made
-            made.chmod(0o755)
-            list_files(made, shlex.join(["hilbo", *sys.argv[1:]]), os.getcwd())
-            _publish(made, out, force)
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
-
-
-def _publish(made: Path, out: Path, force: bool) -> None:
-    """The complete folder `made` becomes `out`. What somebody put there meanwhile stays, and so does what was made,
-    under another name."""
-    try:
-        _check_free(out, force)
-    except InputError as error:
-        beside = next(path for n in itertools.count(2) if not (path := out.with_name(f"{out.name}-{n}")).exists())
-        made.rename(beside)
-        raise InputError(f"{error} It came while this was computed; these results are in {beside}.") from None
-    if out.exists():
-        shutil.rmtree(out)
-    made.rename(out)
+    with orderly(), new_folder(out, lambda: _check_free(out, force)) as made:
+        begin_painter()
+        yield made
+        list_files(made, shlex.join(["hilbo", *sys.argv[1:]]), os.getcwd())
 
 
 def _check_free(out: Path, force: bool) -> None:
@@ -169,12 +143,13 @@ def _check_free(out: Path, force: bool) -> None:
         raise InputError(f"{out}: is a file; choose a folder for --out.")
     if any(out.iterdir()) and not force:
         raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
+    from hilbo.study.disk.lock import LOCK
     from hilbo.study.results.listing import LIST, digest, listed
 
     ours = listed(out).files
     for path in sorted(path for path in out.rglob("*") if not path.is_dir()):
         name = path.relative_to(out).as_posix()
-        if name not in ours and name != LIST:
+        if name not in ours and name not in (LIST, LOCK):
             raise InputError(f"{path}: is not a result of hilbo's; choose another --out, so that it is not lost.")
         if name in ours and digest(path) != ours[name]:
             raise InputError(f"{path}: has been changed since hilbo wrote it; choose another --out, or delete it.")

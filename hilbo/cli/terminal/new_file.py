@@ -1,13 +1,13 @@
 """A file that a command makes: never over another one unasked, and whole or not at all."""
 
 import contextlib
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 from hilbo.errors import InputError
+from hilbo.study.disk import new_file as disk
 
-__all__ = ["check_free", "new_file"]
+__all__ = ["check_free", "new_file", "write_new"]
 
 
 def check_free(out: Path, force: bool) -> None:
@@ -15,7 +15,7 @@ def check_free(out: Path, force: bool) -> None:
     if out.exists() and not out.is_file():
         raise InputError(f"{out}: is no file; choose another one.")
     if out.exists() and not force:
-        raise InputError(f"{out}: exists already; choose another file, or add --force to replace it.")
+        raise InputError(_exists(out))
     folder = out.resolve().parent
     if not folder.is_dir():
         wrong = "is a file" if folder.exists() else "does not exist"
@@ -23,14 +23,23 @@ def check_free(out: Path, force: bool) -> None:
 
 
 @contextlib.contextmanager
-def new_file(out: Path) -> Iterator[Path]:
-    """A path beside `out` to write to, which takes its place when the block ends well. Raises `InputError`."""
-    unfinished = out.with_name(f".{out.name}.part")
+def new_file(out: Path, force: bool) -> Iterator[Path]:
+    """A path beside `out` to write to, which takes its place when the block ends well. Raises `InputError`, also where
+    something has the name by then and `force` is not given."""
     try:
-        yield unfinished
-        os.replace(unfinished, out)
+        with disk.new_file(out, replace=force) as unfinished:
+            yield unfinished
+    except FileExistsError as error:
+        raise InputError(_exists(out)) from error
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); choose another file.") from error
-    finally:
-        with contextlib.suppress(OSError):
-            unfinished.unlink(missing_ok=True)
+
+
+def write_new(out: Path, text: str, force: bool) -> None:
+    """Write a whole file, as `new_file` does. Raises `InputError`."""
+    with new_file(out, force) as path:
+        path.write_text(text, encoding="utf-8")
+
+
+def _exists(out: Path) -> str:
+    return f"{out}: exists already; choose another file, or add --force to replace it."

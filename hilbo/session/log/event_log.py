@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from hilbo.errors import InputError
-from hilbo.session.log.file_lock import lock
 from hilbo.session.log.header_check import check_new_header
 from hilbo.session.log.log_lines import WHY_CUT, event_line, header_line, is_unbegun, read_lines
 from hilbo.session.log.records import Event, Header
 from hilbo.session.log.replay import replayed
 from hilbo.session.log.state import LiveSession
+from hilbo.study.disk.lock import lock
+from hilbo.study.disk.new_file import sync_folder
 from hilbo.study.file.reading import AnyStudy
 from hilbo.study.formats.json_file import read_bytes
 
@@ -60,8 +61,9 @@ class EventLog:
         state = LiveSession.start(study, header)
         check_new_header(study, header)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), _MODE)
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+            file = os.open(path, flags, _MODE)
         except OSError as error:
             raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder.") from error
         log = cls(path, file, state, b"", 0, "")
@@ -74,7 +76,7 @@ class EventLog:
         except (LogError, InputError):
             log.close()
             raise
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
         return log
 
     @classmethod
@@ -238,18 +240,6 @@ def _cut(file, size):
         os.fsync(file)
     except OSError:
         pass
-
-
-def _sync_folder(folder):
-    """So that the new name is on the disk too; where folders cannot be opened, the system sees to that."""
-    try:
-        handle = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _content(file) -> bytes:

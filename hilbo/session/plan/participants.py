@@ -6,14 +6,15 @@ and the protocol's number must stand there before the first trial.
 
 import csv
 import datetime
+import io
 import os
-import tempfile
 from collections.abc import Mapping
 from itertools import zip_longest
 from pathlib import Path
 
 from hilbo.errors import InputError
-from hilbo.session.log.file_lock import locked_beside
+from hilbo.study.disk.lock import locked_folder
+from hilbo.study.disk.new_file import rewrite_file
 from hilbo.study.formats.cell_text import but_for_case, check_id, check_text, csv_rows
 
 __all__ = ["COLUMNS", "add_person", "check_consent", "read_people"]
@@ -66,8 +67,8 @@ def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
     _check_past(person, str(path))
     place = _place(Path(path))
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with locked_beside(place):
+        place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with locked_folder(place.parent):
             people = read_people(path) if place.exists() else {}
             if person["participant"] in people:
                 raise InputError(
@@ -151,18 +152,6 @@ def _delimiter(path) -> str:
 def _write(path, people, delimiter):
     columns = list(dict.fromkeys((*COLUMNS, *(key for row in people.values() for key in row))))
     rows = [[row.get(column, "") for column in columns] for row in people.values()]
-    _replace(path, [columns, *rows], delimiter)
-
-
-def _replace(path, rows, delimiter):
-    handle, made = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
-    try:
-        with open(handle, "w", newline="", encoding="utf-8") as file:
-            csv.writer(file, delimiter=delimiter, lineterminator="\n").writerows(rows)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(made, path.stat().st_mode if path.exists() else 0o600)
-        os.replace(made, path)
-    except BaseException:
-        Path(made).unlink(missing_ok=True)
-        raise
+    text = io.StringIO()
+    csv.writer(text, delimiter=delimiter, lineterminator="\n").writerows([columns, *rows])
+    rewrite_file(path, text.getvalue())

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.session.log.event_log import in_use, keys_path, read_log
-from hilbo.session.log.file_lock import lock_name, locked_beside
 from hilbo.session.withdrawal.files import Below, files_below, is_closed, refusals, remove
 from hilbo.session.withdrawal.names import CODED_JUDGED, CODED_OWN, file_is_called_after, file_names
 from hilbo.session.withdrawal.results import clear_results, plan_without, results_folders
@@ -30,6 +29,7 @@ from hilbo.session.withdrawal.tables import (
     without_person,
     write_table,
 )
+from hilbo.study.disk.lock import locked_folder
 from hilbo.study.results.listing import LIST, listed, relist
 
 __all__ = ["Withdrawal", "delete_participant"]
@@ -98,12 +98,10 @@ def delete_participant(folder: str | os.PathLike, participant: str, done: Withdr
 def _alone_with_lists(files: Iterable[Path]) -> Iterator[None]:
     """Nobody is added to a list of participants meanwhile, who would be lost when it is written anew. Raises InputError
     before anything is removed if another hilbo is not done with one."""
-    places = sorted({path.resolve() for path in _ending(files, ".csv")})
+    places = sorted({path.resolve().parent for path in _ending(files, ".csv") if _is_list_of_people(path)})
     with contextlib.ExitStack() as locks:
         for place in places:
-            with contextlib.suppress(OSError):  # what cannot be read or locked cannot be written either, which is said
-                if place.with_name(lock_name(place)).exists() or _is_list_of_people(place):
-                    locks.enter_context(locked_beside(place))
+            locks.enter_context(locked_folder(place))
         yield
 
 

@@ -10,6 +10,9 @@ from typing import NamedTuple
 
 import msgspec
 
+from hilbo.study.disk.lock import LOCK
+from hilbo.study.disk.new_file import rewrite_file
+
 __all__ = ["LIST", "Listed", "digest", "list_files", "listed", "relist", "write_list"]
 
 LIST = ".hilbo.json"
@@ -38,7 +41,7 @@ def listed(folder: Path) -> Listed:
 
 def list_files(folder: Path, command: str = "", where: str = "") -> None:
     """Write the list of all files that are in a folder now."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / LIST)
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in (LIST, LOCK))
     write_list(folder, Listed({path.relative_to(folder).as_posix(): digest(path) for path in files}, command, where))
 
 
@@ -58,7 +61,7 @@ def relist(folder: Path, changed: set[Path]) -> None:
 def write_list(folder: Path, content: Listed) -> None:
     """Write a folder's list."""
     made = content.files | ({_COMMAND: content.command, _WHERE: content.where} if content.command else {})
-    (folder / LIST).write_text(json.dumps(made, indent=0, ensure_ascii=False), encoding="utf-8")
+    rewrite_file(folder / LIST, json.dumps(made, indent=0, ensure_ascii=False))
 
 
 def digest(path: Path) -> str:
