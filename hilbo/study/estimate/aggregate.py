@@ -42,6 +42,16 @@ _LARGEST_POOL = 3000  # answers of the pooled alternative: its fit is cubic in t
 First = Callable[[Optimum, RuleMap], None]
 
 
+class Surface(eqx.Module):
+    """A population map as a function of points."""
+
+    map: RuleMap
+
+    def __call__(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of the map at points of the unit cube."""
+        return predict_map(self.map, to_device(x))
+
+
 class Aggregate(eqx.Module):
     """A study's posteriors, its population optimum by the study's rule, and what stands beside it."""
 
@@ -86,9 +96,10 @@ class Aggregate(eqx.Module):
         """Largest variance of the map at a point that somebody answered. A scalar."""
         return asked_variance(self.map, self.cohort)
 
-    def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of the population map at points of the unit cube."""
-        return predict_map(self.map, to_device(x))
+    @property
+    def surface(self) -> Surface:
+        """The population map as a function, for programs too: the ids of the participants are no part of it."""
+        return Surface(self.map)
 
     def class_probabilities(self, likelihood: OrdinalProbit, x: Float[ArrayLike, "m d"]) -> Float[Array, "m C"]:
         """Probabilities (m, C) of a new person's answers at points of the unit cube."""
