@@ -26,12 +26,9 @@ refused; `certify` decides every N, and K1, B1 at their limits, for one paramete
 Units: K N/mm, B1 N·s^α/mm, T s, damping N·s/m.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Real
+from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
 from hilbo.mechanics.delay import check_delay
@@ -39,6 +36,7 @@ from hilbo.mechanics.delayed_bounds import delayed_damping, delayed_largest_K1
 from hilbo.mechanics.fosls import FOSLS, pot_stiffness, share
 from hilbo.mechanics.memory import sums
 from hilbo.mechanics.passivity_certificate import Certificate, Witness, certify, needed_damping, witness
+from hilbo.mechanics.ranges import Number, Reals, Scalar
 from hilbo.mechanics.span import Memory, Span, span
 from hilbo.numerics.host import namespace_of, on_host
 from hilbo.viscoelastic import elementwise
@@ -63,15 +61,15 @@ def __dir__() -> list[str]:
 
 
 def minimum_damping(
-    K1: Real[ArrayLike, "..."],
-    B1: Real[ArrayLike, "..."],
-    alpha: Real[ArrayLike, "..."],
-    K_eff: Real[ArrayLike, "..."] = 0.44,
+    K1: Reals,
+    B1: Reals,
+    alpha: Reals,
+    K_eff: Reals = 0.44,
     N: int = 101,
-    T: Real[ArrayLike, "..."] = 1e-3,
+    T: Reals = 1e-3,
     *,
     memory: Memory = "short",
-    delay: Real[ArrayLike, "..."] = 0.0,
+    delay: Reals = 0.0,
 ) -> Float[Array, "..."]:
     """Smallest device damping b (N·s/m) with which the rendering is passive; elementwise.
 
@@ -88,15 +86,15 @@ def minimum_damping(
 
 
 def largest_K1(
-    B1: Real[ArrayLike, "..."],
-    alpha: Real[ArrayLike, "..."],
-    b: Real[ArrayLike, "..."] = 0.95,
-    K_eff: Real[ArrayLike, "..."] = 0.44,
+    B1: Reals,
+    alpha: Reals,
+    b: Reals = 0.95,
+    K_eff: Reals = 0.44,
     N: int = 101,
-    T: Real[ArrayLike, "..."] = 1e-3,
+    T: Reals = 1e-3,
     *,
     memory: Memory = "short",
-    delay: Real[ArrayLike, "..."] = 0.0,
+    delay: Reals = 0.0,
 ) -> Float[Array, "..."]:
     """Largest passive K1 (N/mm) on a device with damping `b` (N·s/m); elementwise.
 
@@ -114,16 +112,16 @@ def largest_K1(
 
 
 def is_passive(
-    K1: Real[ArrayLike, "..."],
-    B1: Real[ArrayLike, "..."],
-    alpha: Real[ArrayLike, "..."],
-    b: Real[ArrayLike, "..."],
-    K_eff: Real[ArrayLike, "..."] = 0.44,
+    K1: Reals,
+    B1: Reals,
+    alpha: Reals,
+    b: Reals,
+    K_eff: Reals = 0.44,
     N: int = 101,
-    T: Real[ArrayLike, "..."] = 1e-3,
+    T: Reals = 1e-3,
     *,
     memory: Memory = "short",
-    delay: Real[ArrayLike, "..."] = 0.0,
+    delay: Reals = 0.0,
 ) -> Bool[Array, "..."]:
     """Whether the rendering is passive on a device with damping `b` (N·s/m) at every delay of the force from 0 to
     `delay` (s), as a device checks its sets; elementwise.
@@ -155,14 +153,7 @@ def _closed(memory: Memory, N: int) -> Span:
     return span(memory, N)
 
 
-def _minimum_damping(
-    span: Span,
-    K1: Float[Array, ""],
-    B1: Float[Array, ""],
-    alpha: Float[Array, ""],
-    K_eff: Float[Array, ""],
-    T: Float[Array, ""],
-) -> Float[Array, ""]:
+def _minimum_damping(span: Span, K1: Scalar, B1: Scalar, alpha: Scalar, K_eff: Scalar, T: Scalar) -> Scalar:
     """b_min of this module's head, N·s/m; 500·T is T/2 for stiffness in N/mm."""
     beta = pot_stiffness(B1, alpha, T)
     gl = sums(alpha, span)
@@ -171,14 +162,7 @@ def _minimum_damping(
     return jnp.where(K_eff < 0, jnp.inf, 500 * T * stiffness)
 
 
-def _largest_K1(
-    span: Span,
-    B1: Float[Any, ""],
-    alpha: Float[Any, ""],
-    b: Float[Any, ""],
-    K_eff: Float[Any, ""],
-    T: Float[Any, ""],
-) -> Float[Any, ""]:
+def _largest_K1(span: Span, B1: Number, alpha: Number, b: Number, K_eff: Number, T: Number) -> Number:
     """K1max of this module's head, N/mm, and its two limits."""
     xp = namespace_of(B1, alpha, b, K_eff, T)
     beta = pot_stiffness(B1, alpha, T)

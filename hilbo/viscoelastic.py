@@ -20,8 +20,7 @@ from inspect import signature
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Float
 
 from hilbo.mechanics.continuous import creep_compliance, relaxation_modulus
 from hilbo.mechanics.fosls import FOSLS, pot_stiffness, slow_damping, slow_stiffness
@@ -37,7 +36,7 @@ from hilbo.mechanics.materials import (
     springpot,
 )
 from hilbo.mechanics.memory import GLSums, gl_coefficients, gl_sums, sums
-from hilbo.mechanics.ranges import RANGES, check_ranges, possible
+from hilbo.mechanics.ranges import RANGES, Reals, Scalar, check_ranges, possible
 from hilbo.mechanics.span import Memory, Span, span
 from hilbo.mechanics.switching import switched_force
 
@@ -71,25 +70,18 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def gl_sum(alpha: Real[ArrayLike, "..."], N: int) -> Float[Array, "..."]:
+def gl_sum(alpha: Reals, N: int) -> Float[Array, "..."]:
     """S_N = C(1) = Π_{i=1..N} (1 - α/i), elementwise in `alpha`."""
     return elementwise(_gl_sum, span("short", N), alpha)
 
 
-def gl_alternating_sum(alpha: Real[ArrayLike, "..."], N: int) -> Float[Array, "..."]:
+def gl_alternating_sum(alpha: Reals, N: int) -> Float[Array, "..."]:
     """C(-1) = Σ (-1)^i c_i, elementwise in `alpha`; within 3.4e-4 of 2^α at N = 101."""
     return elementwise(_gl_alternating_sum, span("short", N), alpha)
 
 
 def K0_from_effective_stiffness(
-    K1: Real[ArrayLike, "..."],
-    B1: Real[ArrayLike, "..."],
-    alpha: Real[ArrayLike, "..."],
-    K_eff: Real[ArrayLike, "..."] = 0.44,
-    N: int = 101,
-    T: Real[ArrayLike, "..."] = 1e-3,
-    *,
-    memory: Memory = "short",
+    K1: Reals, B1: Reals, alpha: Reals, K_eff: Reals = 0.44, N: int = 101, T: Reals = 1e-3, *, memory: Memory = "short"
 ) -> Float[Array, "..."]:
     """K0 (N/mm) with which the rendering has the static stiffness H(1) = `K_eff` (N/mm); elementwise.
 
@@ -100,36 +92,20 @@ def K0_from_effective_stiffness(
 
 
 def dc_gain(
-    K0: Real[ArrayLike, "..."],
-    K1: Real[ArrayLike, "..."],
-    B1: Real[ArrayLike, "..."],
-    alpha: Real[ArrayLike, "..."],
-    N: int = 101,
-    T: Real[ArrayLike, "..."] = 1e-3,
-    *,
-    memory: Memory = "short",
+    K0: Reals, K1: Reals, B1: Reals, alpha: Reals, N: int = 101, T: Reals = 1e-3, *, memory: Memory = "short"
 ) -> Float[Array, "..."]:
     """Static stiffness H(1) (N/mm) of the sampled model; elementwise."""
     return elementwise(_dc_gain, span(memory, N), K0, K1, B1, alpha, T)
 
 
 def effective_damping(
-    K1: Real[ArrayLike, "..."],
-    B1: Real[ArrayLike, "..."],
-    alpha: Real[ArrayLike, "..."],
-    N: int = 101,
-    T: Real[ArrayLike, "..."] = 1e-3,
-    *,
-    memory: Memory = "short",
-    states: int = 10,
+    K1: Reals, B1: Reals, alpha: Reals, N: int = 101, T: Reals = 1e-3, *, memory: Memory = "short", states: int = 10
 ) -> Float[Array, "..."]:
     """dH/ds at s = 0 (N·s/m): the damping felt in slow motion, T·K1²·β·M1/(K1 + β·S_N)²; elementwise."""
     return elementwise(_effective_damping, span(memory, N, states), K1, B1, alpha, T)
 
 
-def elementwise(
-    function: Callable, span: Span, *args: Real[ArrayLike, "..."], batch: int | None = None
-) -> Float[Array, "..."]:
+def elementwise(function: Callable, span: Span, *args: Reals, batch: int | None = None) -> Float[Array, "..."]:
     """Apply `function(span, *scalars)` over broadcast arguments in their common floating dtype, compiled once; `batch`
     elements at a time where one takes much memory.
 
@@ -165,37 +141,21 @@ def _compiled(
     return flat.reshape(same[0].shape)
 
 
-def _gl_sum(span: Span, alpha: Float[Array, ""]) -> Float[Array, ""]:
+def _gl_sum(span: Span, alpha: Scalar) -> Scalar:
     return sums(alpha, span).at_dc
 
 
-def _gl_alternating_sum(span: Span, alpha: Float[Array, ""]) -> Float[Array, ""]:
+def _gl_alternating_sum(span: Span, alpha: Scalar) -> Scalar:
     return sums(alpha, span).at_nyquist
 
 
-def _K0(
-    span: Span,
-    K1: Float[Array, ""],
-    B1: Float[Array, ""],
-    alpha: Float[Array, ""],
-    K_eff: Float[Array, ""],
-    T: Float[Array, ""],
-) -> Float[Array, ""]:
+def _K0(span: Span, K1: Scalar, B1: Scalar, alpha: Scalar, K_eff: Scalar, T: Scalar) -> Scalar:
     return K_eff - slow_stiffness(K1, pot_stiffness(B1, alpha, T), sums(alpha, span))
 
 
-def _dc_gain(
-    span: Span,
-    K0: Float[Array, ""],
-    K1: Float[Array, ""],
-    B1: Float[Array, ""],
-    alpha: Float[Array, ""],
-    T: Float[Array, ""],
-) -> Float[Array, ""]:
+def _dc_gain(span: Span, K0: Scalar, K1: Scalar, B1: Scalar, alpha: Scalar, T: Scalar) -> Scalar:
     return K0 + slow_stiffness(K1, pot_stiffness(B1, alpha, T), sums(alpha, span))
 
 
-def _effective_damping(
-    span: Span, K1: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""], T: Float[Array, ""]
-) -> Float[Array, ""]:
+def _effective_damping(span: Span, K1: Scalar, B1: Scalar, alpha: Scalar, T: Scalar) -> Scalar:
     return slow_damping(K1, pot_stiffness(B1, alpha, T), sums(alpha, span), T)

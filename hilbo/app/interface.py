@@ -1,11 +1,11 @@
-"""A session being held, as its parts see it: what a `Hub` is for whoever leads, interrupts, commands or shows it.
+"""The hub of a live session as its parts see it: what the runner, interruptions, commands and pages may use of a `Hub`.
 
-The hub makes its parts, and they know no more of it than this: nothing but `commit` reaches the log.
+The hub makes its parts, so that they cannot import it. Only `commit` writes to the log.
 """
 
 import asyncio
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol, runtime_checkable
 
 from hilbo.app.rigs.rig import Rig
@@ -13,160 +13,112 @@ from hilbo.app.wire.security import Role
 from hilbo.session.log.records import Event
 from hilbo.session.log.state import LiveSession
 
-__all__ = ["Held", "Leading", "Looking"]
+__all__ = ["HubInterface", "RunnerInterface", "WatchersInterface"]
 
 
 @runtime_checkable
-class Leading(Protocol):
-    """What leads a session on, the `Runner`: where it is, and what makes it go on."""
+class RunnerInterface(Protocol):
+    """The task that presents trials (`Runner`)."""
 
-    @property
-    def stage(self) -> str:
-        """What it is at."""
-        ...
-
-    @property
-    def step(self) -> int | None:
-        """The step of the trial that is being felt."""
-        ...
-
-    @property
-    def ends(self) -> float:
-        """When that step ends, by the monotonic clock."""
-        ...
-
-    @property
-    def trouble(self) -> str:
-        """Why it does not go on."""
-        ...
-
-    @property
-    def fits_after(self) -> int:
-        """Fits that a participant had to wait for."""
-        ...
+    stage: str
+    """What it does now, such as "choosing", "step", "answer", "trouble"."""
+    step: int | None
+    """Index of the step of the trial that is being presented."""
+    ends: float
+    """When that step ends, s, on the monotonic clock."""
+    trouble: str
+    """Why the session does not continue; empty where it does."""
+    fits_after: int
+    """Number of fits made after an answer, while the participant waited."""
 
     def restart(self) -> None:
-        """Leave what is going on, and begin with what the state says now."""
-        ...
+        """Cancel the present work and start again from the current state."""
 
     def wake(self) -> None:
-        """What is waited for may have happened."""
-        ...
+        """Check the awaited condition again."""
 
     def forget(self) -> None:
-        """The rig has no rendering any more."""
-        ...
+        """Treat the rig as having no rendering in force."""
 
 
 @runtime_checkable
-class Looking(Protocol):
-    """Who looks, the `Watchers`."""
+class WatchersInterface(Protocol):
+    """The open pages and programs (`Watchers`)."""
 
     @property
     def participant_here(self) -> bool:
-        """Whether the participant's page is there."""
+        """Whether the participant's page is open."""
         ...
 
 
 @runtime_checkable
-class Held(Protocol):
-    """The session. `begun`: the participant has said so, since the server started or the page came back."""
+class HubInterface(Protocol):
+    """The session that is being run (`Hub`). Attributes that only the hub sets are properties."""
 
     begun: bool
-
-    @property
-    def state(self) -> LiveSession:
-        """The fold of the log."""
-        ...
+    """Whether the participant has pressed Begin since the server started or the page came back."""
+    state: LiveSession
+    """The session's state: the events of the log, replayed."""
+    chooser: Any
+    """Proposes the trials (`LiveChooser`)."""
+    compute: ThreadPoolExecutor
+    """The thread in which trials are chosen."""
+    tag: str
+    """Prefix of the trials' names in browsers."""
+    gap: float
+    """Pause between two trials, s."""
+    delays: list[dict[str, float]]
+    """Seconds from each answer to the next parameters in force, by part."""
+    without_map: str
+    """Why there is no map, as a sentence; empty where there is one."""
+    alert: str | None
+    """Why the log cannot be written."""
+    trust: list[list[str]]
+    """Names and values that say how reliable the map is."""
+    invite: Callable[[Role], dict[str, str]] | None
+    """Makes a new link for a role."""
 
     @property
     def rig(self) -> Rig:
-        """What shows renderings; there is one from the hub's `open` on."""
+        """Presents the renderings; available once the hub is open."""
         ...
 
     @property
-    def runner(self) -> Leading:
-        """What leads it on."""
+    def runner(self) -> RunnerInterface:
+        """The task that presents trials."""
         ...
 
     @property
-    def watchers(self) -> Looking:
-        """Who looks."""
-        ...
-
-    @property
-    def chooser(self) -> Any:
-        """What proposes."""
-        ...
-
-    @property
-    def compute(self) -> Executor:
-        """The thread in which it does so."""
+    def watchers(self) -> WatchersInterface:
+        """The open pages and programs."""
         ...
 
     @property
     def warm(self) -> asyncio.Future:
-        """Done when all that is needed is compiled."""
-        ...
-
-    @property
-    def tag(self) -> str:
-        """What trials are known by in browsers."""
-        ...
-
-    @property
-    def gap(self) -> float:
-        """Pause between two trials, s."""
-        ...
-
-    @property
-    def delays(self) -> list[dict[str, float]]:
-        """Seconds from each answer to parameters in force, in parts."""
+        """Done when everything that the session needs is compiled."""
         ...
 
     @property
     def recent(self) -> Sequence[Event]:
-        """The newest events, the last one first."""
-        ...
-
-    @property
-    def without_map(self) -> str:
-        """Why there will be no map, in a sentence; empty where nothing hinders it."""
-        ...
-
-    @property
-    def alert(self) -> str | None:
-        """Why nothing can be written."""
+        """The latest events, newest first."""
         ...
 
     @property
     def fault(self) -> str | None:
-        """What of the watch over the session does not work."""
-        ...
-
-    @property
-    def trust(self) -> list[list[str]]:
-        """How far the map is to be trusted: names and values."""
+        """What fails in watching for interruptions."""
         ...
 
     @property
     def draws(self) -> bool:
-        """Whether there are slices of the map to be had."""
-        ...
-
-    @property
-    def invite(self) -> Callable[[Role], dict[str, str]] | None:
-        """Makes a new link for a role."""
+        """Whether slices of the map are available."""
         ...
 
     async def commit(self, make: Callable[[LiveSession, float], Event | None], *, mine: bool = False) -> Any:
-        """Have an event made from the newest state, on the disk, and counted."""
-        ...
+        """Make an event from the newest state, write it to the log, and apply it."""
 
     async def map(self) -> dict[str, Any] | None:
         """Slices of the posterior."""
         ...
 
     def publish(self) -> None:
-        """Tell everybody who looks that there is news."""
-        ...
+        """Notify all open pages of a change."""

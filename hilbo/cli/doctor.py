@@ -1,7 +1,7 @@
-"""Is everything ready for a session? Each check says what it found and, where something is wrong, what to fix.
+"""Checks before a session (`hilbo doctor`): what each one found and, where something is wrong, how to fix it.
 
-Nothing is changed: a file of a few bytes is written and removed where logs will be, and the device is asked, stopped,
-and never started.
+Nothing is changed: a file of a few bytes is written and removed where logs will be, and the device is queried and
+stopped, never started.
 """
 
 import os
@@ -29,12 +29,17 @@ _JOINS = 120.0  # s that the program that presents has to join
 
 
 class Check(NamedTuple):
-    """What was looked at, how it is, in words; and what to do, empty where nothing is to be done."""
+    """A check: its name, its result as a level and in words, and how to fix it (empty where nothing is wrong)."""
 
     name: str
     level: Level
     words: str
     fix: str = ""
+
+
+def _check(name: str, words: str, fix: str | Literal[False], level: Level = "bad") -> Check:
+    """A check of this `level` where there is something to fix, else a good one."""
+    return Check(name, level if fix else "good", words, fix or "")
 
 
 def checks(
@@ -44,10 +49,10 @@ def checks(
     port: int,
     begin: Callable[[], Any] = lambda: None,
 ) -> Iterator[Check]:
-    """One check after the other. `connect(damping, delay)` opens the device, logs go to `folder`, `port` is that of the
-    server.
+    """All checks, one after the other. `connect(damping, delay)` opens the device, logs go to `folder`, `port` is that
+    of the server.
 
-    What JAX is needed for comes last, after `begin`; the rest does not wait for it.
+    The checks that need JAX come last, after `begin`, which starts it: the others do not wait for it.
     """
     yield _versions()
     yield _disk(folder)
@@ -95,9 +100,7 @@ def _disk(folder: Path) -> Check:
     except OSError as error:
         return Check("disk", "bad", f"{place}: {error.strerror}", "choose a folder for logs that can be written")
     words = f"{place}: {free:,.0f} MB free, a line is safe on the disk after {1000 * took:.1f} ms"
-    if free < _ROOM:
-        return Check("disk", "bad", words, f"make {_ROOM} MB of room, or choose another folder")
-    return Check("disk", "good", words)
+    return _check("disk", words, free < _ROOM and f"make {_ROOM} MB of room, or choose another folder")
 
 
 def _port(port: int) -> Check:
@@ -128,9 +131,7 @@ def _serial_ports() -> Check:
     except InputError as error:
         return Check("serial ports", "note", "pyserial is missing", str(error))
     words = ", ".join(f"{port.name} ({port.description})" for port in serial_ports) or "none"
-    return Check(
-        "serial ports", "good" if serial_ports else "note", words, "" if serial_ports else "plug the device in"
-    )
+    return _check("serial ports", words, not serial_ports and "plug the device in", "note")
 
 
 def _study_file(path: Path) -> tuple[Check, Any]:
@@ -158,22 +159,15 @@ def _precision() -> Check:
 
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     size = sum(file.stat().st_size for file in Path(cache).glob("*")) / 1e6 if cache and Path(cache).is_dir() else 0.0
-    words = (
-        f"{jnp.zeros(()).dtype}, {jax.devices()[0].platform}; compiled functions are kept in {cache} ({size:.0f} MB)"
-    )
-    if jnp.zeros(()).dtype != jnp.float64:
-        return Check("precision and cache", "note", words, "sessions are meant for float64")
-    empty = size == 0
-    return Check(
-        "precision and cache",
-        "note" if empty else "good",
-        words,
-        "the first session compiles for a minute; run `hilbo simulate --live` once before" if empty else "",
-    )
+    dtype = jnp.zeros(()).dtype
+    words = f"{dtype}, {jax.devices()[0].platform}; compiled functions are kept in {cache} ({size:.0f} MB)"
+    fix = "" if size else "the first session compiles for a minute; run `hilbo simulate --live` once before"
+    fix = fix if dtype == jnp.float64 else "sessions are meant for float64"
+    return _check("precision and cache", words, fix, "note")
 
 
 def _study(path: Path) -> Iterator[Check]:
-    """What is computed of a study whose file is in order."""
+    """The checks that need the study's model."""
     from hilbo.study.config import Study
 
     try:
@@ -187,7 +181,7 @@ def _study(path: Path) -> Iterator[Check]:
 
 
 def _feasible(study: Any) -> Check:
-    """What mechanics and constraints leave."""
+    """The share of the search space that is passive and within the constraints."""
     from hilbo.search.rendering import delay_words
     from hilbo.search.space import share_of_cube
 
@@ -198,14 +192,12 @@ def _feasible(study: Any) -> Check:
         share = share_of_cube(space)
         shown = f"{100 * share:.1f} %" if share >= 0.001 else "less than 0.1 %"
         parts.append(f"{shown} of the box is within the constraints{' as well' if parts else ''}")
-    words = ", ".join(parts)
-    if space.mechanics is not None and space.volume() < 0.02:
-        return Check("feasible set", "bad", words, "lower K1's range, or use a device with more damping")
-    return Check("feasible set", "good", words)
+    small = space.mechanics is not None and space.volume() < 0.02
+    return _check("feasible set", ", ".join(parts), small and "lower K1's range, or use a device with more damping")
 
 
 def _step(study: Any) -> Check:
-    """From an answer to the next point without anything chosen in advance, compiled before."""
+    """Time from an answer to the next point, compiled before but not chosen in advance."""
     steps = min(study.selection.space_filling + 1, study.selection.trials - 1)
     if not steps:
         return Check("time of a step", "good", "none to measure: a session has one trial")
@@ -218,9 +210,7 @@ def _step(study: Any) -> Check:
         session = session.tell(study.responses[0])
         took = time.perf_counter() - begun
     words = f"{1000 * took:.0f} ms from an answer to the next point, where nothing was chosen ahead"
-    return Check(
-        "time of a step", "note" if took > _SLOW else "good", words, "close other programs" if took > _SLOW else ""
-    )
+    return _check("time of a step", words, took > _SLOW and "close other programs", "note")
 
 
 def _device(connect: Callable[[float | None, float | None], Any], file: Any) -> Iterator[Check]:
@@ -242,7 +232,7 @@ def _device(connect: Callable[[float | None, float | None], Any], file: Any) -> 
 
 
 def _language(file: Any) -> Iterator[Check]:
-    """Whether participants can read all of it, and whether somebody has read it before them."""
+    """Whether all texts are translated, and reviewed by a native speaker."""
     from hilbo.study.file.languages import LANGUAGES, language
 
     session = file.session
@@ -251,40 +241,35 @@ def _language(file: Any) -> Iterator[Check]:
     name = LANGUAGES[session.language]
     if left := session.untranslated(file.responses):
         yield Check("language", "note", f"no {name} words for {', '.join(left)}", "write [session.labels]")
-    elif not language(session.language).reviewed:
+    elif language(session.language).reviewed:
+        yield Check("language", "good", name)
+    else:
         fix = "have a native speaker read both pages of a session with --dry-run"
         yield Check("language", "note", f"{name}: no native speaker has reviewed these texts", fix)
-    else:
-        yield Check("language", "good", name)
 
 
 def _stimulus(file: Any) -> Iterator[Check]:
-    """What a study still lacks whose renderings a program presents."""
+    """Completeness of a study whose stimuli are presented by a program or a person."""
     table, parameters = file.stimulus, file.space.parameters
     off = ", ".join(f"{p.name} {table.tolerance_words(p)}" for p in parameters if not p.levels)
     words = f"a {table.by} presents, and confirms within {table.within:g} s"
     words += f"; values may be off by {off}" if off else ""
-    said = file.tables.stimulus is not None
     try:
         table.check_shares(parameters)
-        yield Check("stimulus", "good" if said else "note", words, "" if said else "say so in a table [stimulus]")
+        yield _check("stimulus", words, file.tables.stimulus is None and "say so in a table [stimulus]", "note")
     except InputError as error:
         yield Check("stimulus", "bad", str(error), "fix the study file")
     left = [key for key in ("title", "hello", "feel_reference", "feel_test") if key not in file.session.texts]
-    yield Check(
-        "participants' texts",
-        "note" if left else "good",
-        f"{len(left)} speak of feeling a device: {', '.join(left)}" if left else "the study's own",
-        "write your own in [session.texts]" if left else "",
-    )
+    words = f"{len(left)} speak of feeling a device: {', '.join(left)}" if left else "the study's own"
+    yield _check("participants' texts", words, bool(left) and "write your own in [session.texts]", "note")
     number = file.session.protocol_number
-    fix = "" if number else "write [session] protocol_number, so that it is compared with what people agreed to"
-    yield Check("protocol number", "good" if number else "note", number or "the study names none", fix)
+    fix = "write [session] protocol_number, so that it is compared with what people agreed to"
+    yield _check("protocol number", number or "the study names none", not number and fix, "note")
 
 
 def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator[Check]:
-    """Have the program join, present and stop; it is given a link on stderr. Raises `InputError` where a device
-    renders."""
+    """Have the stimulus program join (by a link on stderr), present and stop. Raises `InputError` for a study without
+    one."""
     from hilbo.app.rigs.stimulus_check import StimulusCheck
     from hilbo.app.server import serve
     from hilbo.study.file.reading import StudyFile
@@ -321,21 +306,17 @@ def _loopback(device: Any) -> Check:
         wrong += device.echo(data) != data
     took = (time.perf_counter() - begun) / count
     words = f"{count} messages there and back, {wrong} wrong, {1000 * took:.1f} ms each"
-    return Check("device loopback", "bad" if wrong else "good", words, "check cable and ground" if wrong else "")
+    return _check("device loopback", words, wrong > 0 and "check cable and ground")
 
 
 def _damping(has: float, needs: float) -> Check:
     words = f"the study counts on {needs:g} N·s/m, the device says {has:g}"
-    if has < needs * (1 - 1e-6):
-        return Check("damping", "bad", words, "measure it (`hilbo device measure-damping`), then lower the study's")
-    return Check("damping", "good", words)
+    fix = "measure it (`hilbo device measure-damping`), then lower the study's"
+    return _check("damping", words, has < needs * (1 - 1e-6) and fix)
 
 
 def _delay(has: float, counted: float) -> Check:
-    """The delay for which the device checks sets must be one that the study's search knows of."""
-    words = (
-        f"the study assumes a delay of at most {1e3 * counted:g} ms; the device checks its sets for {1e3 * has:g} ms"
-    )
-    if has > counted + 1e-9:
-        return Check("delay", "bad", words, f"write [renderer] delay = {has:g} and plan the study again")
-    return Check("delay", "good", words)
+    """Whether the study's search space takes the delay into account for which the device checks sets."""
+    words = f"the study assumes a delay of at most {1e3 * counted:g} ms; the device checks its sets for"
+    fix = f"write [renderer] delay = {has:g} and plan the study again"
+    return _check("delay", f"{words} {1e3 * has:g} ms", has > counted + 1e-9 and fix)

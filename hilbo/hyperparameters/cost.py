@@ -4,7 +4,7 @@ Given with gradient and Hessian: of Laplace's and EP's evidence in closed form, 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from hilbo.hyperparameters.coordinates import OF_THE_LIKELIHOOD, Coordinates, co
 from hilbo.hyperparameters.ep_evidence import ep_evidence
 from hilbo.hyperparameters.laplace_evidence import Evidence, laplace_evidence
 from hilbo.kernels import gram
-from hilbo.likelihoods import OrdinalProbit, OrdinalTerms, TiltedTerms
+from hilbo.likelihoods import OrdinalTerms, TiltedTerms
 from hilbo.numerics.linalg import one_at_a_time
 from hilbo.numerics.newton import Expansion, expanded
 from hilbo.ordinal_gp import OrdinalGP, Trials, fit
@@ -119,14 +119,7 @@ def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, sta
 
     `start`: weights near which the mode is sought.
     """
-    split = _split(gp, coordinates, trials, start.dtype)
-    return laplace_evidence(
-        split.covariance,
-        lambda of_terms: OrdinalTerms(split.likelihood(of_terms), trials.q, trials.mask),
-        split.of_likelihood,
-        split.of_kernel,
-        start,
-    )
+    return laplace_evidence(*_parts(gp, coordinates, trials, start.dtype, OrdinalTerms), start)
 
 
 @one_at_a_time
@@ -134,26 +127,22 @@ def person_ep_evidence(
     gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: tuple[Float[Array, " n"], Float[Array, " n"]]
 ) -> Evidence:
     """The same by expectation propagation; `start`: means and log variances of cavities, as in [`ep_evidence`][]."""
-    split = _split(gp, coordinates, trials, start[0].dtype)
-    return ep_evidence(
-        split.covariance,
-        lambda of_terms: TiltedTerms(split.likelihood(of_terms), trials.q, trials.mask),
-        split.of_likelihood,
-        split.of_kernel,
-        start,
-    )
+    return ep_evidence(*_parts(gp, coordinates, trials, start[0].dtype, TiltedTerms), start)
 
 
-class _Split(NamedTuple):
-    """K as a function of the kernel's coordinates, the likelihood as one of its own, and both as vectors."""
-
-    covariance: Callable[[Float[Array, " k"]], Float[Array, "n n"]]
-    likelihood: Callable[[Float[Array, " l"]], OrdinalProbit]
-    of_likelihood: Float[Array, " l"]
-    of_kernel: Float[Array, " k"]
+_Terms = TypeVar("_Terms", OrdinalTerms, TiltedTerms)
 
 
-def _split(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, dtype: DTypeLike) -> _Split:
+def _parts(
+    gp: OrdinalGP, coordinates: Coordinates, trials: Trials, dtype: DTypeLike, terms: type[_Terms]
+) -> tuple[
+    Callable[[Float[Array, " k"]], Float[Array, "n n"]],
+    Callable[[Float[Array, " l"]], _Terms],
+    Float[Array, " l"],
+    Float[Array, " k"],
+]:
+    """K as a function of the kernel's coordinates, the answers' terms as one of the likelihood's, and these two vectors
+    of coordinates."""
     of_likelihood = {name: value for name, value in coordinates.items() if name in OF_THE_LIKELIHOOD}
     of_kernel = {name: value for name, value in coordinates.items() if name not in OF_THE_LIKELIHOOD}
     flat_likelihood, restore_likelihood = ravel_pytree(of_likelihood)
@@ -162,7 +151,7 @@ def _split(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, dtype: DType
     def covariance(flat: Float[Array, " k"]) -> Float[Array, "n n"]:
         return gram(model_at(of_likelihood | restore_kernel(flat), gp).kernel, trials.x, trials.x)
 
-    def likelihood(flat: Float[Array, " l"]) -> OrdinalProbit:
-        return model_at(restore_likelihood(flat) | of_kernel, gp).likelihood
+    def answers(flat: Float[Array, " l"]) -> _Terms:
+        return terms(model_at(restore_likelihood(flat) | of_kernel, gp).likelihood, trials.q, trials.mask)
 
-    return _Split(covariance, likelihood, flat_likelihood.astype(dtype), flat_kernel.astype(dtype))
+    return covariance, answers, flat_likelihood.astype(dtype), flat_kernel.astype(dtype)

@@ -88,9 +88,8 @@ def maximise_evidence(
 
     Raises `InputError` for names in `learn` that are not learnt, and for an inference without derivatives.
     """
-    return _maximise(
-        gp, jax.tree.map(lambda leaf: leaf[None], trials), learn, weak_priors, starts, max_steps, inference
-    )
+    options = _Options(_checked(learn, inference), weak_priors, starts, max_steps, inference)
+    return _maximise(gp, jax.tree.map(lambda leaf: leaf[None], trials), options)
 
 
 def maximise_shared_evidence(
@@ -107,36 +106,22 @@ def maximise_shared_evidence(
 
     Arguments as those of [`maximise_evidence`][], and it raises the same errors.
     """
-    return _maximise(gp, trials, learn, weak_priors, starts, max_steps, inference)
-
-
-def _maximise(
-    gp: OrdinalGP,
-    trials: Trials,
-    learn: Sequence[str],
-    weak_priors: bool,
-    starts: int,
-    max_steps: int,
-    inference: str,
-) -> MaximumEvidence:
-    learn = _checked(learn)
-    if inference == "exact":
-        raise InputError(
-            'hyperparameters: inference "exact" has no derivatives to learn by; use "ep", which is near it.'
-        )
-    options = _Options(learn, weak_priors, starts, max_steps, inference)
-    # Person by person on a CPU: each search stops when it is done, where a batch would wait for its slowest.
-    return one_at_a_time(lambda gp, trials: _search(gp, trials, options))(gp, trials)
+    return _maximise(gp, trials, _Options(_checked(learn, inference), weak_priors, starts, max_steps, inference))
 
 
 class _Options(NamedTuple):
-    """What is sought, and how; static."""
+    """The search's options, which are static: see `maximise_evidence`."""
 
     learn: tuple[str, ...]
     weak_priors: bool
     starts: int
     max_steps: int
     inference: str
+
+
+def _maximise(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence:
+    """The search, person by person on a CPU: each stops when it is done, where a batch would wait for its slowest."""
+    return one_at_a_time(lambda gp, trials: _search(gp, trials, options))(gp, trials)
 
 
 def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence:
@@ -207,7 +192,8 @@ def _flat(end: Expansion, trials: Trials) -> Bool[Array, ""]:
     return eigh(end.hessian)[0][0] * divisor(trials) < _FLAT
 
 
-def _checked(learn: Sequence[str]) -> tuple[str, ...]:
+def _checked(learn: Sequence[str], inference: str) -> tuple[str, ...]:
+    """The names to learn. Raises `InputError` for unknown ones, for all three scales, and without derivatives."""
     learn = tuple(learn)
     unknown = [name for name in learn if name not in get_args(Learnable)]
     if unknown or not learn:
@@ -217,6 +203,10 @@ def _checked(learn: Sequence[str]) -> tuple[str, ...]:
         raise InputError(
             "hyperparameters: variance, noise and thresholds cannot all be learnt, because the scale of the latent"
             " function would be free; leave one of them fixed."
+        )
+    if inference == "exact":
+        raise InputError(
+            'hyperparameters: inference "exact" has no derivatives to learn by; use "ep", which is near it.'
         )
     return learn
 

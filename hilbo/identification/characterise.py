@@ -1,9 +1,9 @@
-"""All that is to be known about a material from its tests: fit, intervals, residuals, memory, passivity.
+"""Identification of a material from its tests: fit, intervals, residuals, memory, passivity.
 
-The best curve is always there (`Characterisation.fit`). Whether its parameters mean something is said apart: a
-parameter is *identified* if its 95 % profile interval has two ends, *one-sided* if it has one, *at bound* if the fit
-ran to the edge of the search, and *not identifiable* if the data set no end at all. K0, K1 and B1 follow from all four
-coordinates; their intervals are quantiles under the normal approximation in those.
+There is always a best fit (`Characterisation.fit`). Whether the data determine a parameter is its status: *identified*
+if its 95 % profile interval has two ends, *one-sided* if it has one, *at bound* if the fit ran to the edge of the
+search, *not identifiable* if the interval has no end. K0, K1 and B1 follow from all four coordinates; their intervals
+are quantiles under the normal approximation of the coordinates.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -33,7 +33,7 @@ _FILTERED = 4.0  # standard deviations, above which a filter of the force is fit
 
 
 class Characterisation(NamedTuple):
-    """A fit and everything beside it; `estimates` by name, `noise` by kind of test."""
+    """A fit and its uncertainty; `estimates` by name, `noise` by kind of test."""
 
     fit: Fit
     estimates: dict[str, Estimate]
@@ -73,14 +73,11 @@ def characterise(
         say("memory")
     rows = select_memory(tests, model.T, choices, *_instrument(best_fit)) if choices else ()
     words = sentences(best_fit, sides, sampling, estimates, residuals, tests)
-    ends = None if boot is None else [np.asarray(best_fit.model.natural(end)) for end in boot]
-    named = (
-        None
-        if ends is None
-        else dict(zip(best_fit.model.labels, zip(*map(np.ndarray.tolist, ends), strict=True), strict=True))
-    )
+    if boot is not None:
+        ends = [np.asarray(best_fit.model.natural(end)).tolist() for end in boot]
+        boot = dict(zip(best_fit.model.labels, zip(*ends, strict=True), strict=True))
     return Characterisation(
-        best_fit, estimates, named, residuals, nrmse(best_fit), float(sampling.freedom), damping, rows, words
+        best_fit, estimates, boot, residuals, nrmse(best_fit), float(sampling.freedom), damping, rows, words
     )
 
 
@@ -130,34 +127,26 @@ def _estimates(best_fit: Fit, sides: intervals.Intervals, sampling: intervals.Sp
     whole = all(estimate.known for estimate in estimates.values())
     derived = _quantiles(best_fit, sampling, seed) if whole else {}
     others = {name: number for name, number in best_fit.parameters().items() if name not in labels}
-    rest = {name: _derived(number, derived.get(name)) for name, number in others.items()}
-    return rest | estimates
-
-
-def _derived(value: float, ends: tuple[float, ...] | None) -> Estimate:
-    """What follows from all coordinates: known where all of them are."""
-    if ends is None:
-        return Estimate(value, None, None, "not identifiable")
-    return Estimate(value, ends[0], ends[1], "identified")
+    status = "identified" if whole else "not identifiable"
+    ends = {name: derived.get(name, (None, None)) for name in others}
+    return {name: Estimate(value, ends[name][0], ends[name][1], status) for name, value in others.items()} | estimates
 
 
 def _status(ok, open_lower, open_upper, held) -> str:
     """What an estimate is worth, in the words of this module's head; `ok`: both searches for an end came to one."""
     if held:
         return "at bound"
-    if not ok:
-        return "not identifiable"
-    if open_lower and open_upper:
+    if not ok or (open_lower and open_upper):
         return "not identifiable"
     return "one-sided" if open_lower or open_upper else "identified"
 
 
-def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str, tuple[float, ...]]:
-    """95 % of what follows from all coordinates, over draws of these."""
+def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str, list[float]]:
+    """95 % intervals of the derived parameters, from draws of the coordinates."""
     rng = np.random.default_rng(seed)
     draws = rng.multivariate_normal(np.asarray(best_fit.q), np.asarray(sampling.covariance), _DRAWS, method="eigh")
     sets = jax.vmap(best_fit.model.parameters)(jnp.asarray(draws))
-    return {name: tuple(np.quantile(np.asarray(v), [0.025, 0.975]).tolist()) for name, v in sets.items()}
+    return {name: np.quantile(np.asarray(v), [0.025, 0.975]).tolist() for name, v in sets.items()}
 
 
 def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
@@ -183,9 +172,7 @@ def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
 def _minimum_damping(best_fit: Fit) -> float | None:
     """Smallest passive damping of the set, N·s/m; None for an even number of taps (closed form too low) and moduli."""
     model, values = best_fit.model, best_fit.parameters()
-    if not isinstance(model, Sampled):
-        return None
-    if model.memory == "short" and int(model.N) % 2 == 0:
+    if not isinstance(model, Sampled) or (model.memory == "short" and int(model.N) % 2 == 0):
         return None
     parameters = values["K1"], values["B1"], values["alpha"], values["K_eff"]
     return float(passivity.minimum_damping(*parameters, int(model.N), model.T, memory=model.memory))

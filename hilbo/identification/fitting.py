@@ -203,8 +203,22 @@ class Fit(eqx.Module):
         """The parameter set in physical units."""
         return {name: float(value) for name, value in self.model.parameters(self.q).items()}
 
+    def minimum(
+        self,
+        start: Float[Array, " p"],
+        box: tuple[Array, Array] | None = None,
+        weights: Sequence[Float[Array, " _"]] | None = None,
+        **search: Any,
+    ) -> Solution:
+        """Least squares from a `start` (p,), in the fit's box and under its weights or in others; `search` are options
+        of `least_squares`."""
+        others = self.weights if weights is None else weights
+        ends = (self.lower, self.upper) if box is None else box
+        return least_squares(lambda q: residuals(self.model, self.curves, others, q), start, *ends, **search)
+
     def held(self) -> Bool[Array, " p"]:
-        """Coordinates within a millionth of the box's width of a bound: the data pull them out of it. (p,)."""
+        """Whether each coordinate is within a millionth of the box's width of a bound, out of which the data pull it.
+        (p,)."""
         at_lower, at_upper = self.bounded(self.q)
         return at_lower | at_upper
 
@@ -242,14 +256,8 @@ def polish(fitted: Fit, start: Float[Array, " p"]) -> Fit:
 
 @program
 def _polished(current: Fit, start: Float[Array, " p"]) -> Solution:
-    """The minimum that the search comes to from another start."""
-    return least_squares(
-        lambda q: residuals(current.model, current.curves, current.weights, q),
-        start,
-        current.lower,
-        current.upper,
-        max_steps=_LONGEST,
-    )
+    """The minimum to which the search leads from another start."""
+    return current.minimum(start, max_steps=_LONGEST)
 
 
 def residuals(

@@ -26,10 +26,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo.errors import InputError
-from hilbo.identification.fitting import Fit, curve_residuals, residuals
+from hilbo.identification.fitting import Fit, curve_residuals
 from hilbo.identification.residual_noise import filtered, fitted_residuals, noises
 from hilbo.identification.rounding import variance_of_rounding
-from hilbo.numerics.least_squares import Solution, least_squares, solve_symmetric
+from hilbo.numerics.least_squares import Solution, solve_symmetric
 from hilbo.numerics.tracing import program
 
 __all__ = [
@@ -78,13 +78,9 @@ class Intervals(eqx.Module):
     lowest_q: Float[Array, " p"]
 
 
-def spread(fitted: Fit, quantile: float = 1.959964) -> Spread:
-    """Sandwich variance of the coordinates, with those at a bound held there unless it is their own turn."""
-    return _spread(fitted, quantile)
-
-
 @program
-def _spread(fit: Fit, quantile: float) -> Spread:
+def spread(fit: Fit, quantile: float = 1.959964) -> Spread:
+    """Sandwich variance of the coordinates; those at a bound are held there except for their own variance."""
     q = fit.q
     slopes = jax.jacfwd(lambda x: fitted_residuals(fit, x))(q)
     meat, effective = jnp.zeros_like(fit.solution.normal), jnp.zeros_like(q[0])
@@ -121,7 +117,7 @@ def _across(
 
 def profile_intervals(fitted: Fit, quantile: float = 1.959964) -> Intervals:
     """Profile-likelihood intervals at the level of a normal `quantile` (95 %), all ends in one compiled search."""
-    return _profile(fitted, _spread(fitted, quantile))
+    return _profile(fitted, spread(fitted, quantile))
 
 
 class _Search(NamedTuple):
@@ -163,15 +159,8 @@ def _end(fit: Fit, sampling: Spread, j: Int[Array, ""], sign: Float[Array, ""]) 
 
     def fitted_beside(distance, start):
         value = q[j] + sign * distance
-        lower, upper = (jnp.where(is_j, value, bound) for bound in (fit.lower, fit.upper))
-        return least_squares(
-            lambda x: residuals(fit.model, fit.curves, fit.weights, x),
-            start,
-            lower,
-            upper,
-            max_steps=40,
-            enough=_ENOUGH,
-        )
+        box = jnp.where(is_j, value, fit.lower), jnp.where(is_j, value, fit.upper)
+        return fit.minimum(start, box, max_steps=40, enough=_ENOUGH)
 
     def step(state: _Search) -> _Search:
         distance = jnp.minimum(state.place, room)
@@ -228,13 +217,7 @@ def refits(fitted: Fit, weights: tuple[Float[Array, "B R"], ...]) -> Float[Array
 
     `weights`: (B, R) for each curve -> (B, p).
     """
-
-    def one(row):
-        return least_squares(
-            lambda q: residuals(fitted.model, fitted.curves, row, q), fitted.q, fitted.lower, fitted.upper, max_steps=40
-        ).q
-
-    return jax.lax.map(one, weights)
+    return jax.lax.map(lambda row: fitted.minimum(fitted.q, weights=row, max_steps=40).q, weights)
 
 
 def block_bootstrap(

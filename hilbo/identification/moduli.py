@@ -51,12 +51,12 @@ class Continuous(eqx.Module):
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of q: moduli up to 50 times the largest, κ from 1e-5 to 1e5, α from 0.01 to 0.99. Two arrays (4,)."""
-        top, ends = max(_largest(test) for test in tests), np.log(0.99 / 0.01)
+        (_, top), ends = _extremes(tests), np.log(0.99 / 0.01)
         return np.array([1e-3 * top, 0.0, np.log(1e-5), -ends]), np.array([50 * top, 50 * top, np.log(1e5), ends])
 
     def starts(self, tests: Sequence[Test]) -> Float[np.ndarray, "starts 4"]:
         """Five places from weak and broad to strong and narrow relaxation. (5, 4)."""
-        top, last = max(_largest(test) for test in tests), min(_smallest(test) for test in tests)
+        last, top = _extremes(tests)
         pairs = [(1.0, 0.2), (1.0, 0.4), (1.0, 0.7), (0.1, 0.5), (10.0, 0.5)]
         return np.array([[1.2 * top, 0.5 * last, np.log(kappa), np.log(a / (1 - a))] for kappa, a in pairs])
 
@@ -104,14 +104,14 @@ class FractionalMaxwell(eqx.Module):
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
         """Bounds: τ far beyond the data on both sides, α from 0.1 to 1, β up to 0.9 α. Two arrays (4,)."""
         first, last = min(test.time[0] for test in tests), max(test.time[-1] for test in tests)
-        top = np.log(max(_largest(test) for test in tests))
+        top = np.log(_extremes(tests)[1])
         lower = [top - 25, np.log(first) - 10, 0.1, 0.0]
         return np.array(lower), np.array([top + 10, np.log(last) + 20, 1.0, 0.9])
 
     def starts(self, tests: Sequence[Test]) -> Float[np.ndarray, "starts 4"]:
         """Five places from a narrow to a broad relaxation. (5, 4)."""
         times = np.concatenate([test.time for test in tests])
-        middle, top = 0.5 * np.log(times.min() * times.max()), np.log(max(_largest(test) for test in tests))
+        middle, top = 0.5 * np.log(times.min() * times.max()), np.log(_extremes(tests)[1])
         shapes = [(0.0, 0.5, 0.2), (3.0, 0.7, 0.2), (3.0, 0.9, 0.1), (6.0, 0.5, 0.5), (-3.0, 0.3, 0.2)]
         return np.array([[top - 1, middle + later, alpha, ratio] for later, alpha, ratio in shapes])
 
@@ -145,13 +145,8 @@ def _prepare(test: Test, weights: Weights) -> Curve:
     return Curve(test.kind, jnp.asarray(test.time), jnp.asarray(test.output), zero, jnp.asarray(scale))
 
 
-def _largest(test: Test) -> float:
-    """Largest modulus, as the data have it."""
-    mean = test.output.mean(axis=0)
-    return float(mean.max() if test.kind == "modulus" else 1 / mean.min())
-
-
-def _smallest(test: Test) -> float:
-    """Smallest modulus, as the data have it."""
-    mean = test.output.mean(axis=0)
-    return float(mean.min() if test.kind == "modulus" else 1 / mean.max())
+def _extremes(tests: Sequence[Test]) -> tuple[float, float]:
+    """Smallest and largest modulus of the data."""
+    means = [test.output.mean(axis=0) for test in tests]
+    moduli = [mean if test.kind == "modulus" else 1 / mean for test, mean in zip(tests, means, strict=True)]
+    return float(min(values.min() for values in moduli)), float(max(values.max() for values in moduli))

@@ -61,20 +61,15 @@ def between(
 
 
 def unit_of_force(test: Test) -> float:
-    """What turns the scale of an output into one of force: the mean stiffness for positions."""
-    return _mean_secant(test) if test.kind == "creep" else 1.0
+    """Factor from the scale of the output to one of force: for positions the mean stiffness, N/mm."""
+    force, position = _force_and_position(test)
+    return float(np.mean(np.abs(force)) / np.mean(np.abs(position))) if test.kind == "creep" else 1.0
 
 
 def secant(test: Test) -> float:
     """Largest force over largest position, N/mm."""
     force, position = _force_and_position(test)
     return float(np.max(np.abs(force)) / np.max(np.abs(position)))
-
-
-def _mean_secant(test: Test) -> float:
-    """Mean force over mean position, N/mm."""
-    force, position = _force_and_position(test)
-    return float(np.mean(np.abs(force)) / np.mean(np.abs(position)))
 
 
 def transform_length(count: int) -> int:

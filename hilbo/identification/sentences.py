@@ -60,11 +60,8 @@ def _residuals(residuals: dict[str, dict[str, Any]]) -> Iterator[str]:
                 " the model misses part of the curve, and the intervals take that as correlated noise."
             )
         if row.get("drift", 1.0) < DRIFTS:
-            bootstrap = (
-                " The bootstrap does not contain a drift that all repeats share."
-                if row["repeats"] >= FEWEST_REPEATS
-                else ""
-            )
+            shared = " The bootstrap does not contain a drift that all repeats share."
+            bootstrap = shared if row["repeats"] >= FEWEST_REPEATS else ""
             yield (
                 f"The residuals of the {kind} test drift slowly: the sensor may have been warming up, or the model"
                 " misses part of the curve. The intervals take the drift as a random walk and are uncertain themselves;"

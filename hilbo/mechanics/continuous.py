@@ -15,23 +15,16 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammaln
-from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Float
 
 from hilbo.mechanics.fosls import share
-from hilbo.mechanics.ranges import check_ranges, possible
+from hilbo.mechanics.ranges import Reals, Scalar, check_ranges, possible
 from hilbo.numerics.mittag_leffler import mittag_leffler, mittag_leffler_increment
 
 __all__ = ["creep_compliance", "relaxation_modulus"]
 
 
-def relaxation_modulus(
-    t: Real[ArrayLike, "..."],
-    K0: Real[ArrayLike, "..."],
-    K1: Real[ArrayLike, "..."],
-    B1: Real[ArrayLike, "..."],
-    alpha: Real[ArrayLike, "..."],
-) -> Float[Array, "..."]:
+def relaxation_modulus(t: Reals, K0: Reals, K1: Reals, B1: Reals, alpha: Reals) -> Float[Array, "..."]:
     """G(t) in N/mm for t >= 0; elementwise, differentiable in every parameter, with derivative 0 of the t^α at t = 0.
 
     K1 = inf, a spring-pot beside K0, gives K0 + B1·t^{-α}/Γ(1 - α), which is infinite at t = 0. Raises `InputError` for
@@ -41,13 +34,7 @@ def relaxation_modulus(
     return _elementwise(_relaxation, t, K0, K1, B1, alpha)
 
 
-def creep_compliance(
-    t: Real[ArrayLike, "..."],
-    K0: Real[ArrayLike, "..."],
-    K1: Real[ArrayLike, "..."],
-    B1: Real[ArrayLike, "..."],
-    alpha: Real[ArrayLike, "..."],
-) -> Float[Array, "..."]:
+def creep_compliance(t: Reals, K0: Reals, K1: Reals, B1: Reals, alpha: Reals) -> Float[Array, "..."]:
     """J(t) in mm/N for t >= 0 and K0 >= 0; elementwise and differentiable, K1 may be inf. Errors as those of
     `relaxation_modulus`: under a load, a material of K0 < 0 creeps without end.
 
@@ -58,20 +45,18 @@ def creep_compliance(
 
 
 @partial(jax.jit, static_argnums=0)
-def _elementwise(function: Callable, *args: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
+def _elementwise(function: Callable, *args: Reals) -> Float[Array, "..."]:
     """`function` of scalars over broadcast arguments, in their common floating dtype."""
     dtype = jnp.result_type(1.0, *args)
     return jnp.vectorize(function)(*(jnp.asarray(arg, dtype) for arg in args))
 
 
-def _power(t: Float[Array, ""], alpha: Float[Array, ""]) -> Float[Array, ""]:
+def _power(t: Scalar, alpha: Scalar) -> Scalar:
     """t^α with finite derivatives at t = 0."""
     return jnp.where(t > 0, jnp.where(t > 0, t, 1) ** alpha, 0)
 
 
-def _relaxation(
-    t: Float[Array, ""], K0: Float[Array, ""], K1: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""]
-) -> Float[Array, ""]:
+def _relaxation(t: Scalar, K0: Scalar, K1: Scalar, B1: Scalar, alpha: Scalar) -> Scalar:
     """G(t), and the spring-pot's where K1 is infinite."""
     power = _power(t, alpha)
     rigid = jnp.isinf(K1)
@@ -84,9 +69,7 @@ def _relaxation(
     return jnp.where(allowed, K0 + jnp.where(rigid, pot, branch), jnp.nan)
 
 
-def _creep(
-    t: Float[Array, ""], K0: Float[Array, ""], K1: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""]
-) -> Float[Array, ""]:
+def _creep(t: Scalar, K0: Scalar, K1: Scalar, B1: Scalar, alpha: Scalar) -> Scalar:
     """J(t) in the second form of this module's head."""
     power = _power(t, alpha)
     ratio = share(K1, K0)  # K1/(K0 + K1)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from hilbo.mechanics.ranges import Coefficients, Floats, Number
 from hilbo.numerics.host import namespace_of, scan
 
 __all__ = ["at_angles", "cells_for", "climb", "least", "lowest", "on_grid", "rounding_unit", "rows"]
@@ -28,12 +29,12 @@ def cells_for(degree: int) -> int:
     return 2 ** math.ceil(math.log2(_CELLS_PER_TAP * degree + _LEAST_CELLS))
 
 
-def rounding_unit(p: Float[Any, " n"]) -> float:
+def rounding_unit(p: Coefficients) -> float:
     """Rounding of a value, as a share of Σ |p_j|."""
     return _ROUNDING * namespace_of(p).finfo(p.dtype).eps
 
 
-def least(p: Float[Any, " n"], cells: int, best: Any, peak: Float[Any, ""]) -> Float[Any, ""]:
+def least(p: Coefficients, cells: int, best: Any, peak: Number) -> Number:
     """A lower bound of p, before rounding; sharp where p is least near the angle `peak`, a cell at most from the node
     of number `best`."""
     xp = namespace_of(p)
@@ -49,11 +50,8 @@ def least(p: Float[Any, " n"], cells: int, best: Any, peak: Float[Any, ""]) -> F
 
 
 def climb(
-    expand: Callable[[Float[Any, ""]], tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]],
-    degree: int,
-    start: Float[Any, ""],
-    width: float,
-) -> Float[Any, ""]:
+    expand: Callable[[Number], tuple[Number, Number, Number]], degree: int, start: Number, width: float
+) -> Number:
     """The angle of the largest value within a cell's `width` of `start`: Newton, kept inside. `expand`: an angle -> its
     value, and slope and bend per 1/degree of a polynomial that is least where the value is largest."""
     xp = namespace_of(start)
@@ -68,7 +66,7 @@ def climb(
     return xp.where(expand(angle)[0] > expand(start)[0], angle, start)
 
 
-def rows(p: Float[Any, " n"], count: int) -> Float[Any, "{count} n"]:
+def rows(p: Coefficients, count: int) -> Float[Any, "{count} n"]:
     """p_j·(j/N)^m/m! for m < `count`: with cos, -sin, -cos, sin of jθ in turn, Taylor terms of p in units of 1/N."""
     xp = namespace_of(p)
     j = xp.arange(p.shape[0], dtype=p.dtype) / (p.shape[0] - 1)
@@ -94,7 +92,7 @@ def at_angles(rows: Float[Any, "m n"], angles: Float[Any, " i"]) -> Float[Any, "
     return xp.stack([(cos[m], -sin[m], -cos[m], sin[m])[m % 4] for m in range(len(rows))])
 
 
-def lowest(taylor: Float[Any, "m i"], radius: Float[Any, "..."], rows: Float[Any, "m n"]) -> Float[Any, " i"]:
+def lowest(taylor: Float[Any, "m i"], radius: Floats, rows: Float[Any, "m n"]) -> Float[Any, " i"]:
     """Least value that p can take within `radius` of each angle; the last of the `rows` bounds the remainder."""
     xp = namespace_of(taylor, rows)
     order, scaled = len(rows) - 1, radius * (rows.shape[1] - 1)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Complex, Float
 from hilbo.mechanics.delay import clear_of_spring, larger_root
 from hilbo.mechanics.fosls import pot_stiffness, share
 from hilbo.mechanics.memory import GLSums, gl_coefficients, response, sums
+from hilbo.mechanics.ranges import Scalar
 from hilbo.mechanics.span import Span
 
 __all__ = ["ESTIMATED", "SAFE", "delayed_damping", "delayed_largest_K1", "largest_need"]
@@ -41,7 +42,7 @@ _HALVINGS = 40  # of the interval of K1/(K1 + β)
 class _Order(NamedTuple):
     """An order α with its memory, and the sums of its coefficients."""
 
-    alpha: Float[Array, ""]
+    alpha: Scalar
     sums: GLSums
     span: Span
 
@@ -59,42 +60,31 @@ class _Nodes(NamedTuple):
 class _Material(NamedTuple):
     """A rendering but for C: K0 + series(K1, βC) = K_eff + β·slow·g·(C - S)/(g + h·C), g = K1/(K1 + β) = 1 - h."""
 
-    K_eff: Float[Array, ""]
-    beta: Float[Array, ""]
-    S: Float[Array, ""]
-    g: Float[Array, ""]
-    h: Float[Array, ""]
-    slow: Float[Array, ""]  # K1/(K1 + β·S)
+    K_eff: Scalar
+    beta: Scalar
+    S: Scalar
+    g: Scalar
+    h: Scalar
+    slow: Scalar  # K1/(K1 + β·S)
 
 
 def delayed_damping(
-    span: Span,
-    K1: Float[Array, ""],
-    B1: Float[Array, ""],
-    alpha: Float[Array, ""],
-    K_eff: Float[Array, ""],
-    T: Float[Array, ""],
-    delay: Float[Array, ""],
-) -> Float[Array, ""]:
+    span: Span, K1: Scalar, B1: Scalar, alpha: Scalar, K_eff: Scalar, T: Scalar, delay: Scalar
+) -> Scalar:
     """b_min, N·s/m, to a relative `ESTIMATED`; inf where `K_eff` < 0, NaN for a `delay` above T."""
     lag = _lag(delay, T)
     need, _ = largest_need(span, K1, pot_stiffness(B1, alpha, T), alpha, K_eff, lag)
     return jnp.where(K_eff < 0, jnp.inf, 500 * T * need)
 
 
-def _lag(delay: Float[Array, ""], T: Float[Array, ""]) -> Float[Array, ""]:
+def _lag(delay: Scalar, T: Scalar) -> Scalar:
     """σ, NaN for a delay above T."""
     return jnp.where(delay <= T, delay / T, jnp.nan)
 
 
 def largest_need(
-    span: Span,
-    K1: Float[Array, ""],
-    beta: Float[Array, ""],
-    alpha: Float[Array, ""],
-    K_eff: Float[Array, ""],
-    lag: Float[Array, ""],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    span: Span, K1: Scalar, beta: Scalar, alpha: Scalar, K_eff: Scalar, lag: Scalar
+) -> tuple[Scalar, Scalar]:
     """The largest Y (N/mm) of a set, and its angle; `lag` is σ."""
     order = _order(span, alpha)
     rendering = _material(K1, beta, order, K_eff)
@@ -106,14 +96,8 @@ def largest_need(
 
 
 def delayed_largest_K1(
-    span: Span,
-    B1: Float[Array, ""],
-    alpha: Float[Array, ""],
-    b: Float[Array, ""],
-    K_eff: Float[Array, ""],
-    T: Float[Array, ""],
-    delay: Float[Array, ""],
-) -> Float[Array, ""]:
+    span: Span, B1: Scalar, alpha: Scalar, b: Scalar, K_eff: Scalar, T: Scalar, delay: Scalar
+) -> Scalar:
     """K1max, N/mm, which needs between b·(1 - 2·SAFE) and b; inf where every K1 is passive, 0 where b is below
     `least_damping`. First derivatives are exact, second ones are those at the binding frequency."""
     lag = _lag(delay, T)
@@ -167,7 +151,7 @@ def _solved(span, sought, beta, alpha, Y, K_eff, lag):
     return jnp.where(more, jnp.nan, beta * g / (1 - g)), angle, g == 1
 
 
-def _order(span: Span, alpha: Float[Array, ""]) -> _Order:
+def _order(span: Span, alpha: Scalar) -> _Order:
     return _Order(alpha, sums(alpha, span), span)
 
 
@@ -180,7 +164,7 @@ def _material(K1, beta, order: _Order, K_eff) -> _Material:
     return _Material(K_eff, beta, S, g, h, share(K1, beta * S))
 
 
-def _need(m: _Material, nodes: _Nodes, lag: Float[Array, ""]) -> Float[Array, " n"]:
+def _need(m: _Material, nodes: _Nodes, lag: Scalar) -> Float[Array, " n"]:
     """Y (N/mm) at each frequency."""
     square = (m.g + m.h * nodes.real) ** 2 + (m.h * nodes.imag) ** 2
     size = m.beta * m.g / square
@@ -221,7 +205,7 @@ def _nodes(order: _Order, angle: Float[Array, " n"], C: Complex[Array, " n"]) ->
     return _Nodes(jnp.cos(angle), jnp.sin(angle), C.real, C.imag, lead)
 
 
-def _peak(order: _Order, grid: _Nodes, m: _Material, lag: Float[Array, ""]) -> Float[Array, ""]:
+def _peak(order: _Order, grid: _Nodes, m: _Material, lag: Scalar) -> Scalar:
     """The angle of the largest Y: by the parabolas through neighbouring nodes, and one through closer ones."""
     Y, count = _need(m, grid, lag), grid.real.shape[0] - 1
     # Y is even about both ends.

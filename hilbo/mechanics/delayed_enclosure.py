@@ -10,24 +10,23 @@ is never negative, a cosine polynomial of degree N + 1. With a lower bound -E < 
 
 import math
 from functools import partial
-from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from hilbo.mechanics.cosine_polynomials import at_angles, cells_for, climb, least, on_grid, rounding_unit, rows
 from hilbo.mechanics.delay import larger_root
 from hilbo.mechanics.delayed_bounds import ESTIMATED, largest_need
 from hilbo.mechanics.fosls import FOSLS
+from hilbo.mechanics.ranges import Coefficients, Number, Scalar
 from hilbo.mechanics.response_polynomials import parts_of, square_of, turned_of
 from hilbo.numerics.host import namespace_of
 
 __all__ = ["full_estimate", "short_enclosure"]
 
-_Polynomials = tuple[Float[Any, " n"], Float[Any, " n"], Float[Any, " n"]]
+_Polynomials = tuple[Coefficients, Coefficients, Coefficients]
 
 
-def short_enclosure(model: FOSLS, lag: Float[Any, ""]) -> tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]:
+def short_enclosure(model: FOSLS, lag: Number) -> tuple[Number, Number, Number]:
     """Bounds of max Y (N/mm) over all angles, and the angle of the largest Y found; `lag` is σ."""
     polynomials, least_A = _polynomials(model, lag)
     A, U, W = polynomials
@@ -52,14 +51,14 @@ def short_enclosure(model: FOSLS, lag: Float[Any, ""]) -> tuple[Float[Any, ""], 
     return largest - 4 * error / xp.minimum(A_of_peak, 1), Y + more, peak
 
 
-def full_estimate(model: FOSLS, lag: Float[Any, ""]) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+def full_estimate(model: FOSLS, lag: Number) -> tuple[Scalar, Scalar, Scalar]:
     """As `short_enclosure`, for full memory: the largest Y found, with the error of such a search and no proof."""
     largest, angle = largest_need(model.span, model.K1, model.beta, model.alpha, model.dc_gain(), lag)
     error = ESTIMATED * jnp.abs(largest)
     return largest - error, largest + error, angle
 
 
-def _polynomials(model: FOSLS, lag: Float[Any, ""]) -> tuple[_Polynomials, Float[Any, ""]]:
+def _polynomials(model: FOSLS, lag: Number) -> tuple[_Polynomials, Number]:
     """Cosine coefficients of A, ψA and σ(1 - σ)·|H|²A, all of degree N + 1, and the least value of A."""
     parts = parts_of(model)
     xp = namespace_of(parts.A)
@@ -72,7 +71,7 @@ def _polynomials(model: FOSLS, lag: Float[Any, ""]) -> tuple[_Polynomials, Float
     return (longer(parts.A), late, longer(lag * (1 - lag) * square_of(parts, model.K0))), parts.least_A
 
 
-def _expand(polynomials: _Polynomials, angle: Float[Any, ""]) -> tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]:
+def _expand(polynomials: _Polynomials, angle: Number) -> tuple[Number, Number, Number]:
     """Y at an angle, with slope and bend of P for this number Y, per 1/(N + 1)."""
     a, u, w = (at_angles(rows(p, 3), angle[None])[:, 0] for p in polynomials)
     Y = larger_root(u[0] / a[0], w[0] / a[0])

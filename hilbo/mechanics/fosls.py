@@ -28,7 +28,7 @@ from jaxtyping import Array, Complex, Float, Inexact, Real
 
 from hilbo.errors import InputError
 from hilbo.mechanics.memory import GLSums, gl_coefficients, response, sums
-from hilbo.mechanics.ranges import possible
+from hilbo.mechanics.ranges import Floats, Number, Scalar, possible
 from hilbo.mechanics.recursion import BLOCK, past_of
 from hilbo.mechanics.span import Memory, Span, span
 from hilbo.numerics.host import namespace_of, on_host
@@ -52,10 +52,10 @@ class FOSLS(eqx.Module):
     is NaN for what no model has, and so is what follows from it.
     """
 
-    K0: Float[Any, ""]
-    K1: Float[Any, ""]
-    B1: Float[Any, ""]
-    alpha: Float[Any, ""]
+    K0: Number
+    K1: Number
+    B1: Number
+    alpha: Number
     N: int = eqx.field(static=True)
     T: float = eqx.field(static=True)
     memory: Memory = eqx.field(static=True)
@@ -100,7 +100,7 @@ class FOSLS(eqx.Module):
         return span(self.memory, self.N, self.states)
 
     @property
-    def beta(self) -> Float[Any, ""]:
+    def beta(self) -> Number:
         """β = B1·T^{-α}, N/mm. A scalar."""
         return pot_stiffness(self.B1, self.alpha, self.T)
 
@@ -121,19 +121,19 @@ class FOSLS(eqx.Module):
         pot = jax.lax.complex(size * jnp.cos(lead), size * jnp.sin(lead))
         return self.K0.astype(pot.dtype) + series(self.K1, pot)
 
-    def dc_gain(self) -> Float[Any, ""]:
+    def dc_gain(self) -> Number:
         """Static stiffness H(1), N/mm. A scalar."""
         return self.K0 + slow_stiffness(self.K1, self.beta, sums(self.alpha, self.span))
 
-    def high_frequency_gain(self) -> Float[Any, ""]:
+    def high_frequency_gain(self) -> Number:
         """H(-1), N/mm: the stiffness at the Nyquist frequency. A scalar."""
         return self.K0 + series(self.K1, self.beta * sums(self.alpha, self.span).at_nyquist)
 
-    def instantaneous_stiffness(self) -> Float[Any, ""]:
+    def instantaneous_stiffness(self) -> Number:
         """K0 + k, N/mm: force per step of position in the sample of the step. A scalar."""
         return self.K0 + series(self.K1, self.beta)
 
-    def effective_damping(self) -> Float[Any, ""]:
+    def effective_damping(self) -> Number:
         """dH/ds at s = 0, N·s/m: the damping felt in slow motion. B1 where K1 is infinite and α = 1. A scalar."""
         return slow_damping(self.K1, self.beta, sums(self.alpha, self.span), self.T)
 
@@ -166,7 +166,7 @@ class FOSLS(eqx.Module):
             raise InputError(f"FOSLS: {name} has shape {samples.shape}; give one sample every T, of shape (n,).")
         return samples
 
-    def settling_time(self, fraction: float) -> Float[Array, ""]:
+    def settling_time(self, fraction: float) -> Scalar:
         """Time (s) of the first sample at which this `fraction` of the relaxation after a step is over.
 
         0.9 for t90. With short memory counted sample by sample, `inf` beyond a million samples; with full memory the
@@ -179,7 +179,7 @@ class FOSLS(eqx.Module):
         return jnp.where(jnp.isnan(self.alpha), jnp.nan, find(self, jnp.asarray(fraction, self.K0.dtype)))
 
 
-def series(K1: Float[Any, "..."], pot: Inexact[Any, "..."]) -> Inexact[Any, "..."]:
+def series(K1: Floats, pot: Inexact[Any, "..."]) -> Inexact[Any, "..."]:
     """Stiffness of a spring and a pot in series, K1·pot/(K1 + pot), for every K1 from 0 to inf and complex `pot`.
 
     N/mm; elementwise.
@@ -191,7 +191,7 @@ def series(K1: Float[Any, "..."], pot: Inexact[Any, "..."]) -> Inexact[Any, "...
     return xp.where(firm, pot / (1 + compliance * pot), spring / (1 + spring / pot_of_soft))
 
 
-def share(K1: Float[Any, "..."], pot: Float[Any, "..."]) -> Float[Any, "..."]:
+def share(K1: Floats, pot: Floats) -> Floats:
     """Share of the pot in the elongation of spring and pot in series, K1/(K1 + pot), for every K1 from 0 to inf.
 
     N/mm -> no unit; elementwise.
@@ -202,7 +202,7 @@ def share(K1: Float[Any, "..."], pot: Float[Any, "..."]) -> Float[Any, "..."]:
     return xp.where(firm, 1 / (1 + pot / xp.where(firm, K1, 1)), ratio / (1 + ratio))
 
 
-def pot_stiffness(B1: Float[Any, "..."], alpha: Float[Any, "..."], T: float | Float[Any, "..."]) -> Float[Any, "..."]:
+def pot_stiffness(B1: Floats, alpha: Floats, T: float | Floats) -> Floats:
     """β = B1·T^{-α}, N/mm: the stiffness of the spring-pot in the sample of a step.
 
     B1 in N·s^α/mm, T in s; elementwise.
@@ -210,7 +210,7 @@ def pot_stiffness(B1: Float[Any, "..."], alpha: Float[Any, "..."], T: float | Fl
     return B1 * T**-alpha
 
 
-def slow_stiffness(K1: Float[Any, ""], beta: Float[Any, ""], gl: GLSums) -> Float[Any, ""]:
+def slow_stiffness(K1: Number, beta: Number, gl: GLSums) -> Number:
     """H(1) - K0, N/mm: what spring and spring-pot in series add to the static stiffness.
 
     K1 and `beta` are scalars, in N/mm.
@@ -218,7 +218,7 @@ def slow_stiffness(K1: Float[Any, ""], beta: Float[Any, ""], gl: GLSums) -> Floa
     return series(K1, beta * gl.at_dc)
 
 
-def slow_damping(K1: Float[Any, ""], beta: Float[Any, ""], gl: GLSums, T: float | Float[Any, ""]) -> Float[Any, ""]:
+def slow_damping(K1: Number, beta: Number, gl: GLSums, T: float | Number) -> Number:
     """dH/ds at s = 0, N·s/m: T·K1²·β·M1/(K1 + β·S_N)²; 1000·T is T for stiffness in N/mm.
 
     K1 and `beta` are scalars, in N/mm, T in s.
@@ -258,7 +258,7 @@ def _position(model: FOSLS, F: Float[Array, " n"], start: Start, block: int) -> 
 
 
 @program
-def _short_settling(model: FOSLS, fraction: Float[Array, ""]) -> Float[Array, ""]:
+def _short_settling(model: FOSLS, fraction: Scalar) -> Scalar:
     """First sample n with s_n >= fraction·s_inf after a unit step: the force relaxes as s grows, and s only grows."""
     beta, gl = model.beta, sums(model.alpha, model.span)
     gain, feedback = share(model.K1, beta), share(beta, model.K1)
@@ -279,7 +279,7 @@ def _short_settling(model: FOSLS, fraction: Float[Array, ""]) -> Float[Array, ""
 
 
 @program
-def _full_settling(model: FOSLS, fraction: Float[Array, ""]) -> Float[Array, ""]:
+def _full_settling(model: FOSLS, fraction: Scalar) -> Scalar:
     """z with E_α(-z) = 1 - fraction by bisection of log z, and the time it stands for."""
 
     def halve(_, ends):

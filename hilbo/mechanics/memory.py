@@ -25,6 +25,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Real
 
 from hilbo.mechanics.exponentials import exponentials
+from hilbo.mechanics.ranges import Number, Scalar
 from hilbo.mechanics.span import Span
 from hilbo.numerics.host import namespace_of, on_host, scan
 
@@ -34,10 +35,10 @@ __all__ = ["GLSums", "gl_coefficients", "gl_sums", "response", "sums"]
 class GLSums(eqx.Module):
     """The four sums of Grünwald-Letnikov coefficients that the closed forms need."""
 
-    at_dc: Float[Any, ""]  # S_N = C(1)
-    at_nyquist: Float[Any, ""]  # C(-1), close to 2^α
-    spread: Float[Any, ""]  # C(-1) - C(1) = 2·Σ_{odd i} |c_i|
-    moment: Float[Any, ""]  # M1 = -Σ i·c_i
+    at_dc: Number  # S_N = C(1)
+    at_nyquist: Number  # C(-1), close to 2^α
+    spread: Number  # C(-1) - C(1) = 2·Σ_{odd i} |c_i|
+    moment: Number  # M1 = -Σ i·c_i
 
 
 def sums(alpha: Real[ArrayLike, ""], span: Span) -> GLSums:
@@ -64,7 +65,7 @@ def response(alpha: Real[ArrayLike, ""], angle: Real[Array, "*w"], span: Span) -
 
 
 def _short_response(
-    alpha: Float[Array, ""], angle: Float[Array, "*w"], difference: Complex[Array, "*w"], N: int
+    alpha: Scalar, angle: Float[Array, "*w"], difference: Complex[Array, "*w"], N: int
 ) -> Complex[Array, "*w"]:
     """C as (1 - z^{-1})·Σ_{i<N} S_i z^{-i} + S_N z^{-N}; `difference` is 1 - z^{-1}."""
     delay = jax.lax.complex(jnp.cos(angle), -jnp.sin(angle))
@@ -93,7 +94,7 @@ def gl_sums(alpha: Real[ArrayLike, ""], N: int) -> GLSums:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))
-def _gl_sums_jet(alpha: Float[Array, ""], N: int, order: int) -> tuple[GLSums, ...]:
+def _gl_sums_jet(alpha: Scalar, N: int, order: int) -> tuple[GLSums, ...]:
     """The sums and their derivatives by α up to that order, in one loop, however many directions α moves in.
 
     Without this rule a Hessian carries every direction through the N additions, at ten times the time; and the rule
@@ -126,7 +127,7 @@ def _longer(jet: Callable) -> Callable:
     return extended
 
 
-def _gl_sums(alpha: Float[Any, ""], N: int) -> GLSums:
+def _gl_sums(alpha: Number, N: int) -> GLSums:
     """The sums in one loop over the taps."""
     xp = namespace_of(alpha)
 
@@ -144,13 +145,11 @@ def _gl_sums(alpha: Float[Any, ""], N: int) -> GLSums:
     return scan(add, GLSums(one, one, zero, zero), _indices(alpha, N))
 
 
-def _tap(
-    alpha: Float[Any, ""], partial_sum: Float[Any, ""], i: Float[Any, ""]
-) -> tuple[Float[Any, ""], Float[Any, ""]]:
+def _tap(alpha: Number, partial_sum: Number, i: Number) -> tuple[Number, Number]:
     """From S_{i-1} to S_i and |c_i|."""
     return partial_sum * (1 - alpha / i), alpha / i * partial_sum
 
 
-def _indices(alpha: Float[Any, ""], N: int) -> Float[Any, " {N}"]:
+def _indices(alpha: Number, N: int) -> Float[Any, " {N}"]:
     """1 … N, in the dtype of `alpha`."""
     return namespace_of(alpha).arange(1, N + 1, dtype=alpha.dtype)

@@ -38,6 +38,7 @@ from hilbo.mechanics.delayed_enclosure import full_estimate, short_enclosure
 from hilbo.mechanics.exponentials import exponentials
 from hilbo.mechanics.fosls import FOSLS
 from hilbo.mechanics.memory import gl_coefficients
+from hilbo.mechanics.ranges import Coefficients, Number, Scalar
 from hilbo.mechanics.response_polynomials import parts_of
 from hilbo.numerics.host import namespace_of, on_host
 from hilbo.numerics.shown import concrete, shown
@@ -51,10 +52,10 @@ _LONGEST_CYCLE = 4096  # samples
 class Certificate(eqx.Module):
     """What `certify` knows: bounds of the margin b - b_min, the static stiffness, and where the margin is smallest."""
 
-    lower: Float[Any, ""]  # N·s/m
-    upper: Float[Any, ""]  # N·s/m
-    static_stiffness: Float[Any, ""]  # H(1), N/mm
-    frequency: Float[Any, ""]  # rad/s
+    lower: Number  # N·s/m
+    upper: Number  # N·s/m
+    static_stiffness: Number  # H(1), N/mm
+    frequency: Number  # rad/s
 
     def __repr__(self) -> str:
         margin, stiffness = f"{shown(self.lower)} to {shown(self.upper)} N.s/m", f"{shown(self.static_stiffness)} N/mm"
@@ -143,16 +144,16 @@ def _certify(model: FOSLS, b: Real[ArrayLike, ""]) -> Certificate:
 
 
 @program
-def _certify_late(model: FOSLS, b: Float[Array, ""], delay: Float[Array, ""]) -> Certificate:
+def _certify_late(model: FOSLS, b: Scalar, delay: Scalar) -> Certificate:
     return _late_certificate(jax.lax.stop_gradient(model), b, jax.lax.stop_gradient(delay))
 
 
-def _certificate(model: FOSLS, b: Float[Any, ""]) -> Certificate:
+def _certificate(model: FOSLS, b: Number) -> Certificate:
     enclose = _full_enclosure if model.memory == "full" else _short_enclosure
     return _with_margin(model, b, *enclose(model))
 
 
-def _late_certificate(model: FOSLS, b: Float[Any, ""], delay: Float[Any, ""]) -> Certificate:
+def _late_certificate(model: FOSLS, b: Number, delay: Number) -> Certificate:
     enclose = full_estimate if model.memory == "full" else short_enclosure
     return _with_margin(model, b, *enclose(model, delay / model.T))
 
@@ -162,14 +163,14 @@ def _with_margin(model, b, low, high, angle) -> Certificate:
     return Certificate(b - scale * high, b - scale * low, model.dc_gain(), angle / model.T)
 
 
-def _full_enclosure(model: FOSLS) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+def _full_enclosure(model: FOSLS) -> tuple[Scalar, Scalar, Scalar]:
     """As `_short_enclosure`, for full memory: the Nyquist frequency binds, and only rounding is open."""
     stiffness = model.high_frequency_gain()
     error = 4 * jnp.finfo(stiffness.dtype).eps * stiffness
     return stiffness - error, stiffness + error, jnp.asarray(jnp.pi, stiffness.dtype)
 
 
-def _short_enclosure(model: FOSLS) -> tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]:
+def _short_enclosure(model: FOSLS) -> tuple[Number, Number, Number]:
     """Bounds of max φ over all angles, and the angle of the largest φ found."""
     A, B, least_A, *_ = parts_of(model)
     xp = namespace_of(A)
@@ -186,9 +187,7 @@ def _short_enclosure(model: FOSLS) -> tuple[Float[Any, ""], Float[Any, ""], Floa
     return model.K0 + largest - 4 * rounding, model.K0 + high, peak
 
 
-def _ratio(
-    A: Float[Any, " n"], B: Float[Any, " n"], angle: Float[Any, ""]
-) -> tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]:
+def _ratio(A: Coefficients, B: Coefficients, angle: Number) -> tuple[Number, Number, Number]:
     """B/A, with the slope and bend of (B/A)·A - B for the number B/A, per 1/N."""
     a, b = (at_angles(rows(p, 3), angle[None])[:, 0] for p in (A, B))
     value = b[0] / a[0]

@@ -1,4 +1,4 @@
-"""Which numbers a model, and a device, may have: refused where they are known, NaN where they are traced."""
+"""Valid ranges of the numbers of models and devices: an error for concrete values, NaN for traced ones."""
 
 import functools
 import operator
@@ -6,12 +6,23 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Real
+from jaxtyping import Array, Bool, Float, Real
 
 from hilbo.errors import InputError
 from hilbo.numerics.shown import concrete, shown
 
-__all__ = ["RANGES", "check_ranges", "possible"]
+__all__ = ["RANGES", "Coefficients", "Floats", "Number", "Reals", "Scalar", "check_ranges", "possible"]
+
+Reals = Real[ArrayLike, "..."]
+"""A number or an array of numbers; several broadcast against each other."""
+Scalar = Float[Array, ""]
+"""A floating-point number of JAX."""
+Number = Float[Any, ""]
+"""A floating-point number of JAX or NumPy."""
+Floats = Float[Any, "..."]
+"""Floating-point numbers of JAX or NumPy, elementwise."""
+Coefficients = Float[Any, " n"]
+"""Coefficients (n,) of a polynomial, of JAX or NumPy."""
 
 _FROM_0 = (lambda v: v >= 0, "0 or above")
 _FINITE = (lambda v: (v >= 0) & (v < np.inf), "0 or above, and finite")
@@ -28,8 +39,8 @@ RANGES = {
 """Name -> whether values are allowed, elementwise; and what they must be, in words."""
 
 
-def check_ranges(**values: Real[ArrayLike, "..."]) -> None:
-    """Raises `InputError` for numbers that no model, and no device, has; what is traced is not looked at."""
+def check_ranges(**values: Reals) -> None:
+    """Raise `InputError` for values out of range. Tracers are not checked."""
     for name, value in values.items():
         allowed, words = RANGES[name]
         if concrete(value) and not np.all(fine := allowed(np.asarray(value, float))):
@@ -38,5 +49,5 @@ def check_ranges(**values: Real[ArrayLike, "..."]) -> None:
 
 
 def possible(**values: Any) -> Bool[Array, "..."]:
-    """Whether a model has all of these, elementwise; also of what is traced."""
+    """Whether all values are in range, elementwise; also of tracers."""
     return functools.reduce(operator.and_, (RANGES[name][0](value) for name, value in values.items()))

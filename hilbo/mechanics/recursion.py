@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 
 from hilbo.mechanics.exponentials import exponentials
 from hilbo.mechanics.memory import gl_coefficients
+from hilbo.mechanics.ranges import Scalar
 from hilbo.mechanics.span import Span
 
 __all__ = ["BLOCK", "past_of"]
@@ -41,13 +42,7 @@ class _History(NamedTuple):
 
 
 def past_of(
-    alpha: Float[Array, ""],
-    gain: Float[Array, ""],
-    feedback: Float[Array, ""],
-    u: Float[Array, " n"],
-    before: Float[Array, ""],
-    span: Span,
-    block: int = BLOCK,
+    alpha: Scalar, gain: Scalar, feedback: Scalar, u: Float[Array, " n"], before: Scalar, span: Span, block: int = BLOCK
 ) -> Float[Array, " n"]:
     """s_n at every sample, for a history that has been at y = `before` for ever.
 
@@ -69,7 +64,7 @@ def past_of(
     return past.reshape(-1)[: u.shape[0]]
 
 
-def _taps(alpha: Float[Array, ""], before: Float[Array, ""], span: Span, block: int) -> _History:
+def _taps(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
     """Short memory: the state is the last values of y, the newest last."""
     N, length = span.N, max(span.N, block)
     taps = jnp.zeros(length + block, alpha.dtype).at[:N].set(-gl_coefficients(alpha, N)[1:])
@@ -81,7 +76,7 @@ def _taps(alpha: Float[Array, ""], before: Float[Array, ""], span: Span, block: 
     return _History(taps[:block], taps[delay - 1], write, jnp.full(length, before))
 
 
-def _means(alpha: Float[Array, ""], before: Float[Array, ""], span: Span, block: int) -> _History:
+def _means(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
     """Full memory: the state is one mean for each exponential, |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1}."""
     weight, loss = exponentials(alpha, span.states)
     # As products, which have derivatives at λ = 0.
@@ -95,7 +90,7 @@ def _means(alpha: Float[Array, ""], before: Float[Array, ""], span: Span, block:
     return _History(carry @ loss, carry, write, jnp.full(span.states, before))
 
 
-def _impulse(taps: Float[Array, " m"], feedback: Float[Array, ""]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+def _impulse(taps: Float[Array, " m"], feedback: Scalar) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """d_0 … d_{m-1}, and (d - 1)/ρ = Σ |c_i| d_{j-i}, which is the echo of an input in s."""
 
     def add(backwards, _):

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from jaxtyping import Float
 
 from hilbo.mechanics.fosls import FOSLS, series, share
+from hilbo.mechanics.ranges import Coefficients, Number
 from hilbo.numerics.host import namespace_of
 
 __all__ = ["Parts", "parts_of", "square_of", "turned_of"]
@@ -22,14 +23,14 @@ __all__ = ["Parts", "parts_of", "square_of", "turned_of"]
 class Parts(NamedTuple):
     """Cosine coefficients of degree N, and g, h, k of this module's head."""
 
-    A: Float[Any, " n"]
-    B: Float[Any, " n"]
-    least_A: Float[Any, ""]  # (g + h·S_N)² > 0, the least value of A
-    C: Float[Any, " n"]  # Re C
-    square: Float[Any, " n"]  # |C|²
-    g: Float[Any, ""]
-    h: Float[Any, ""]
-    k: Float[Any, ""]
+    A: Coefficients
+    B: Coefficients
+    least_A: Number  # (g + h·S_N)² > 0, the least value of A
+    C: Coefficients  # Re C
+    square: Coefficients  # |C|²
+    g: Number
+    h: Number
+    k: Number
 
 
 def parts_of(model: FOSLS) -> Parts:
@@ -51,7 +52,7 @@ def parts_of(model: FOSLS) -> Parts:
     return Parts(A, k * (g * V + h * square), (g + h * last) ** 2, c, square, g, h, k)
 
 
-def turned_of(parts: Parts, K0: Float[Any, ""]) -> Float[Any, " m"]:
+def turned_of(parts: Parts, K0: Number) -> Float[Any, " m"]:
     """Cosine coefficients of Re(e^{-jθ}·H)·A, one more than those of A."""
     xp = namespace_of(parts.A)
     zero = xp.zeros(1, parts.A.dtype)
@@ -62,7 +63,7 @@ def turned_of(parts: Parts, K0: Float[Any, ""]) -> Float[Any, " m"]:
     return up + down + parts.k * parts.g * late
 
 
-def square_of(parts: Parts, K0: Float[Any, ""]) -> Float[Any, " n"]:
+def square_of(parts: Parts, K0: Number) -> Coefficients:
     """Cosine coefficients of |H|²·A."""
     xp = namespace_of(parts.A)
     still, moving = K0 * parts.g, K0 * parts.h + parts.k

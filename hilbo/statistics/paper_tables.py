@@ -61,22 +61,21 @@ def paper_tables(
     staged = table.assign(set_a=table["set_a"].map(roles), set_b=table["set_b"].map(roles))
     staged["preferred"] = [roles.get(name, name) for name in table["preferred"]]
     staged = staged[staged["set_a"].isin(ROLES) & staged["set_b"].isin(ROLES) & (staged["set_a"] != staged["set_b"])]
-    answers, limits = classifications(staged, responses), []
+    answers, tables, limits = classifications(staged, responses), [], []
     makers = {
         "II": lambda: _table_2(answers, responses, level),
         "III": lambda: _table_3(answers, responses, level),
         "IV": lambda: _table_4(table, sources, roles, level),
     }
-    tables = {}
     for number, make in makers.items():
         try:
-            tables[number] = make()
+            tables.append(make())
         except InputError as error:
-            tables[number] = None
+            tables.append(None)
             limits.append(f"Table {number} is missing: {error}")
-    counts = confusion(staged, responses, ROLES)
     rates = preference_rates(staged, ROLES, level=level)
-    return PaperTables(tables["II"], tables["III"], tables["IV"], counts, rates, tuple(limits))
+    table_2, table_3, table_4 = tables
+    return PaperTables(table_2, table_3, table_4, confusion(staged, responses, ROLES), rates, tuple(limits))
 
 
 def set_sources(table: pd.DataFrame, sets: pd.DataFrame | None) -> tuple[dict[str, str], dict[str, str]]:

@@ -1,4 +1,4 @@
-"""What a validation session counted: classes of each set, preferences of each pair, rates with every kind of interval.
+"""Counts of validation sessions: classes of each set, preferences of each pair, rates with every kind of interval.
 
 The rate of a pair is wins/(wins + losses); ties are counted beside it, and modelled by `logits.tied_preferences`.
 Wilson and Clopper-Pearson ("exact") intervals take all answers as independent. The clustered ones are those of
@@ -43,10 +43,7 @@ def confusion(table: pd.DataFrame, responses: Sequence[str] = RESPONSES, sets: S
 
 
 def rate(
-    success: Sequence | np.ndarray | pd.Series,
-    clusters: Clusters | None = None,
-    *,
-    level: float = 0.95,
+    success: Sequence | np.ndarray | pd.Series, clusters: Clusters | None = None, *, level: float = 0.95
 ) -> pd.DataFrame:
     """Share of successes (n,) with each kind of interval.
 
@@ -67,21 +64,14 @@ def rate(
     elif labels:
         fitted = binary_logit(hits, None, clusters, level=level).table
         fitted = fitted[fitted["errors"] != "iid"]
-        rows += list(
-            zip(fitted["errors"], expit(fitted["low"]), expit(fitted["high"]), fitted["p_value"], fitted["assumes"],
-                strict=True)
-        )  # fmt: skip
+        fitted = fitted.assign(low=expit(fitted["low"]), high=expit(fitted["high"]))
+        rows += fitted[["errors", "low", "high", "p_value", "assumes"]].itertuples(index=False, name=None)
     table = pd.DataFrame(rows, columns=["errors", "low", "high", "p_value", "assumes"])
     table.insert(0, "rate", float(hits.mean()))
     return table
 
 
-def preference_rates(
-    table: pd.DataFrame,
-    sets: Sequence[str] = (),
-    *,
-    level: float = 0.95,
-) -> pd.DataFrame:
+def preference_rates(table: pd.DataFrame, sets: Sequence[str] = (), *, level: float = 0.95) -> pd.DataFrame:
     """Of each pair of sets, how often the first was preferred: one row per pair and kind of interval.
 
     `sets` are the ones to compare, in the order in which a pair names them; all, by the alphabet, if none is given.

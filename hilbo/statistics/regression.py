@@ -67,7 +67,7 @@ class Errors(eqx.Module):
     covariance: Covariance
 
     def in_units(self, units: Float[np.ndarray, " k"]) -> "Errors":
-        """Of coefficients of columns that are so many times as large."""
+        """The errors of the same coefficients where each column is multiplied by its unit."""
         matrix = self.covariance.matrix / np.outer(units, units)
         return eqx.tree_at(lambda errors: errors.covariance.matrix, self, matrix)
 
@@ -175,15 +175,12 @@ def _kinds(fitted: Fit, labels: Mapping[str, Int[np.ndarray, " n"]]) -> tuple[li
 
 
 def _below_iid(kinds: list[Errors], terms: Mapping[int, str]) -> list[str]:
-    """A sentence for each kind of clustered error that is below the iid one in some coefficient."""
+    """A sentence for each kind of clustered error that is smaller than the iid error of some coefficient."""
     reference, sentences = kinds[0].std_errors, []
     for kind in kinds[1:]:
         errors = kind.std_errors
-        below = [
-            f"{name} ({errors[j]:.3g} against {reference[j]:.3g})"
-            for j, name in terms.items()
-            if errors[j] < reference[j]
-        ]
+        less = {j: name for j, name in terms.items() if errors[j] < reference[j]}
+        below = [f"{name} ({errors[j]:.3g} against {reference[j]:.3g})" for j, name in less.items()]
         if below:
             sentences.append(
                 f"Errors {kind.name} are below the iid ones for {', '.join(below)}: by chance, or because answers"
@@ -199,29 +196,16 @@ def _wald(
     error, dof = float(kind.std_errors[j]), kind.covariance.degrees_of_freedom
     if error <= _NO_SPREAD * iid_errors[j]:
         return _row(term, estimate, kind.name, f"{kind.assumes}; {_NOTHING_LEFT}", degrees_of_freedom=dof)
-    reach = float(stats.t.ppf((1 + level) / 2, dof)) * error
+    half_width, statistic = float(stats.t.ppf((1 + level) / 2, dof)) * error, estimate / error
+    numbers = {"std_error": error, "statistic": statistic, "degrees_of_freedom": dof}
+    numbers |= {"p_value": float(2 * stats.t.sf(abs(statistic), dof))}
     return _row(
-        term,
-        estimate,
-        kind.name,
-        kind.assumes,
-        std_error=error,
-        statistic=estimate / error,
-        degrees_of_freedom=dof,
-        p_value=float(2 * stats.t.sf(abs(estimate) / error, dof)),
-        low=estimate - reach,
-        high=estimate + reach,
+        term, estimate, kind.name, kind.assumes, **numbers, low=estimate - half_width, high=estimate + half_width
     )
 
 
 def _profiled(
-    model: Design,
-    j: int,
-    term: str,
-    start: Float[np.ndarray, " k"],
-    separated: Separation,
-    level: float | None,
-    unit: float,
+    model: Design, j: int, term: str, start: np.ndarray, separated: Separation, level: float | None, unit: float
 ) -> dict[str, Any]:
     """The row of a coefficient without a finite estimate; without a level no interval. `unit`: of its column."""
     low, high, p_value = (np.nan,) * 3 if level is None else profile(model, j, start, separated, level)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from hilbo.app.interface import Held
+from hilbo.app.interface import HubInterface
 from hilbo.app.pages import views
 from hilbo.app.rigs.rig import Rig
 from hilbo.app.wire.messages import Command
@@ -29,7 +29,7 @@ def others_present(title: str) -> str:
     return f"In this session {who.get(title, 'a device renders, and no program presents')}."
 
 
-async def carry_out(hub: Held, what: str, message: Command) -> dict[str, Any]:
+async def carry_out(hub: HubInterface, what: str, message: Command) -> dict[str, Any]:
     """One of `COMMANDS`, in the session of a `Hub`. Raises `NotNowError`, and `InputError` for a message that lacks
     what the command needs."""
     if what == "estop":
@@ -67,7 +67,7 @@ def _event_of(what: str, message: Command) -> Callable[[LiveSession, float], Eve
     return actions.repeat
 
 
-def _goes_on(hub: Held) -> Callable[[LiveSession, float], Event]:
+def _goes_on(hub: HubInterface) -> Callable[[LiveSession, float], Event]:
     """From a break, or from the end of a block, as whoever is there by then."""
 
     def make(state, at):
@@ -90,7 +90,7 @@ def _taken(state: LiveSession, what: str, message: Command, at: float) -> Event:
     return actions.undo(state, at, message.reason)
 
 
-def _invitation(hub: Held, message: Command) -> dict[str, str]:
+def _invitation(hub: HubInterface, message: Command) -> dict[str, str]:
     """A new link for a role that this session has."""
     if hub.invite is None:
         raise NotNowError("This session gives no links.")

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from hilbo.app.interface import Held
+from hilbo.app.interface import HubInterface
 from hilbo.app.rigs.rig import Snapshot
 from hilbo.errors import InputError
 from hilbo.session.log import actions
@@ -32,7 +32,7 @@ _GONE = 3.0  # s without a participant's page until a trial that is being felt i
 class Interruptions:
     """Those of a `Hub`, from `begin` to `end`."""
 
-    def __init__(self, hub: Held):
+    def __init__(self, hub: HubInterface):
         self.hub = hub
         self._condition = ""  # the device's, when it was last seen
         self._unsaid: deque[Callable[[LiveSession, float], Any]] = deque()  # what it did, not yet on the disk
@@ -138,7 +138,7 @@ class Interruptions:
             await interrupt(hub, "The participant's page is closed.")
 
 
-async def interrupt(hub: Held, why: str) -> None:
+async def interrupt(hub: HubInterface, why: str) -> None:
     """What was being felt is felt again from its beginning, once somebody presses Begin. `why`: a note in the log."""
     pending, hub.begun = hub.state.pending, False
     with contextlib.suppress(InputError, LogError):

@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from typing import Any
 
 from hilbo.app.hub.interruptions import interrupt
-from hilbo.app.interface import Held
+from hilbo.app.interface import HubInterface
 from hilbo.app.rigs.rig import Loaded, MissedError, Showing
 from hilbo.session.log import actions
 from hilbo.session.log.records import Event, RefusedError, Trial
@@ -35,7 +35,7 @@ class HandError(RuntimeError):
 class Runner:
     """Leads a `Hub` on: `stage` says what it is at, for the views; `ends` when the present step does (monotonic)."""
 
-    def __init__(self, hub: Held):
+    def __init__(self, hub: HubInterface):
         self.hub = hub
         self.stage, self.trouble = "idle", ""
         self.step: int | None = None

@@ -1,7 +1,7 @@
-"""What participant and experimenter are shown of a session, as plain dicts for JSON.
+"""The participant's and the experimenter's view of a session, as plain dicts for JSON.
 
-The participant's holds no parameter, no name of a set and no prediction: it is made from the protocol and its texts,
-never by leaving something out of the experimenter's.
+The participant's view holds no parameter, no name of a set and no prediction: it is built from the protocol and its
+texts, never by removing something from the experimenter's.
 """
 
 from typing import Any
@@ -15,19 +15,9 @@ from hilbo.study.file.protocols import protocol
 
 __all__ = ["experimenter_view", "participant_view"]
 
-_SCREEN_TEXT = {
-    "wait": "wait",
-    "trial": "wait",
-    "ready": "ready",
-    "rest": "rest",
-    "paused": "paused",
-    "done": "done",
-    "ended": "ended",
-}
-
 
 def participant_view(state: LiveSession) -> dict[str, Any]:
-    """What the participant's page is told; nothing else of a session may reach their browser.
+    """The data of the participant's page; nothing else of a session may reach their browser.
 
     `screen` and its `message`; `trial` (id, presentation, steps with their texts and seconds, the running `step`,
     `felt`, `asks`) or None; `progress` (done, of, text); `may` (which buttons); `texts`.
@@ -36,7 +26,7 @@ def participant_view(state: LiveSession) -> dict[str, Any]:
     trial = state.pending if state.screen in ("trial", "paused") else None
     return {
         "screen": state.screen,
-        "message": session.text(_SCREEN_TEXT[state.screen]),
+        "message": session.text("wait" if state.screen == "trial" else state.screen),
         "trial": None if trial is None else _shown_trial(state, trial),
         "progress": _progress(state),
         "rest": state.header.blocks[state.block].rest if state.screen == "rest" and state.block is not None else None,
@@ -50,6 +40,7 @@ def participant_view(state: LiveSession) -> dict[str, Any]:
 
 
 def _spare(state):
+    """Whether the warm-up has another trial to offer."""
     before = state.block - 1
     return state.quota(before) < len(state.header.blocks[before].trials)
 
@@ -92,7 +83,8 @@ def _ask(state, ask, alone):
 
 
 def _progress(state):
-    """Answers of the present part, out of how many; of the last one at the end. In words the trial, from 1."""
+    """Answered and planned trials of the current block (at the end: of the last one), and the text with the trial's
+    number, counted from 1."""
     block = len(state.header.blocks) - 1 if state.block is None else state.block
     if state.pending is not None:
         block = state.pending.block
@@ -107,7 +99,7 @@ def _progress(state):
 
 
 def experimenter_view(state: LiveSession) -> dict[str, Any]:
-    """Everything there is to see."""
+    """The whole state, for the experimenter's page and for programs."""
     header = state.header
     return {
         "study": {"name": state.study.name, "hash": state.study.hash, "responses": list(state.study.responses)},
@@ -140,7 +132,7 @@ def experimenter_view(state: LiveSession) -> dict[str, Any]:
 
 
 def _put_off(state, block, k):
-    """A planned trial that comes last, and how often the device stopped it."""
+    """A planned trial that was moved to the end, and how often the device stopped it."""
     return msgspec.to_builtins(state.header.blocks[block].trials[k]) | {"stops": state.stops(block)[k]}
 
 

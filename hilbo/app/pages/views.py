@@ -1,7 +1,7 @@
-"""What each role's page is told, from the state, the runner's stage and the device.
+"""The data of each role's page, from the state, the runner's stage and the device.
 
-The participant's view is made from `participant_view`, that is from the protocol and its texts: nothing here adds a
-parameter, a set or a prediction to it. Times go over as seconds that are left, so that clocks need not agree.
+The participant's view is built from `participant_view`, that is from the protocol and its texts: nothing here adds a
+parameter, a set or a prediction to it. Times are sent as remaining seconds, so that clocks need not agree.
 """
 
 import math
@@ -9,7 +9,7 @@ import time
 from datetime import datetime
 from typing import Any
 
-from hilbo.app.interface import Held
+from hilbo.app.interface import HubInterface
 from hilbo.app.pages.log_words import line, meant, place_of, table
 from hilbo.app.pages.pace import minutes_left
 from hilbo.app.pages.session_views import experimenter_view, participant_view
@@ -38,13 +38,13 @@ _SCREEN_WORDS = {
 }
 
 
-def trial_name(hub: Held) -> str | None:
-    """What the pending trial is called in browsers: another one whenever it is begun again."""
+def trial_name(hub: HubInterface) -> str | None:
+    """The pending trial's name in browsers, which changes whenever the trial is presented again."""
     trial = hub.state.pending
     return None if trial is None else f"{hub.tag}:{trial.id}.{trial.presentation}"
 
 
-def participant(hub: Held) -> dict[str, Any]:
+def participant(hub: HubInterface) -> dict[str, Any]:
     """The participant's view; docs/guides/live.md describes it."""
     seen, session, stage = participant_view(hub.state), hub.state.study.session, hub.runner.stage
     trial, screen = seen["trial"], seen["screen"]
@@ -74,19 +74,19 @@ def participant(hub: Held) -> dict[str, Any]:
 
 
 def _words(hub, screen, stage, text):
-    """Title, message and phase where nothing is felt. How a program's stimulus is let go, the study's own text says."""
+    """Title, message and phase while nothing is presented. How to let go of a program's stimulus is in the study's own
+    texts."""
     if screen == "trial":
         key = {"hello": "title", "between": "sent", "let-go": "let_go", "trouble": "trouble"}.get(stage, "wait")
         more = {"hello": "hello"} | ({"let-go": "lift"} if hub.state.study.stimulus is None else {})
         message = text(more[stage]) if stage in more else ""
         return text(key), message, stage if stage == "hello" else "wait"
-    heads = {"wait": "wait", "ready": "ready", "rest": "rest", "paused": "paused", "done": "done", "ended": "ended"}
-    title, stop, message = text(heads[screen]).partition(". ")
+    title, stop, message = text(screen).partition(". ")
     return title + stop.strip(), message, screen
 
 
 def _last_of_one(hub, step) -> bool:
-    """Whether the only rendering is being felt: it may be answered meanwhile; two are compared when both are felt."""
+    """Whether a trial's only rendering is being presented: it may be answered meanwhile, a pair only after both."""
     return step is not None and step["index"] + 1 == step["count"] and len(hub.state.pending.renderings) == 1
 
 
@@ -113,8 +113,8 @@ def _progress(progress, text):
     return {"done": progress["done"], "of": progress["of"], "text": words}
 
 
-def experimenter(hub: Held) -> dict[str, Any]:
-    """Everything, in the order of the page; `whole` is the session's own view, for programs."""
+def experimenter(hub: HubInterface) -> dict[str, Any]:
+    """The experimenter's view, in the order of the page; `whole` is the complete state, for programs."""
     state, runner = hub.state, hub.runner
     header, trial = state.header, state.pending
     phase = _SCREEN_WORDS.get(state.screen) or _phase_words(hub, trial)
@@ -131,17 +131,9 @@ def experimenter(hub: Held) -> dict[str, Any]:
         "trust": hub.trust,
         "table": table(state),
         "log": [line(state, event) for event in list(hub.recent)[:60]],
-        "alert": hub.alert
-        or hub.fault
-        or (runner.trouble if runner.stage == "trouble" else None)
-        or hub.without_map
-        or None,
+        "alert": hub.alert or hub.fault or (runner.stage == "trouble" and runner.trouble) or hub.without_map or None,
         "may": _may(hub),
-        "means": {
-            "void": meant(state.voidable),
-            "undo": meant(state.last_answered),
-            "skip": meant(state.skippable),
-        },
+        "means": {"void": meant(state.voidable), "undo": meant(state.last_answered), "skip": meant(state.skippable)},
         "map_version": map_version(state) + ("" if hub.draws else " later"),
         "participant_here": hub.watchers.participant_here,
         "all_delays": hub.delays[-1000:],
@@ -151,7 +143,7 @@ def experimenter(hub: Held) -> dict[str, Any]:
 
 
 def _banners(hub) -> list[str]:
-    """What this session is not: nobody shall take a rehearsal for one that counts."""
+    """Notices of a session whose data do not count."""
     header, banners = hub.state.header, []
     if header.dry_run:
         banners.append("Dry run: nobody takes part, and no table has these answers")
@@ -192,7 +184,7 @@ def _trial_rows(hub, trial):
 
 
 def choice_rows(choice: dict[str, Any]) -> list[list[str]]:
-    """Why a rendering was chosen: name and value, of what is known (older logs hold null for what was no number)."""
+    """Why a rendering was chosen, as rows of name and value; null stands in logs for numbers that were not finite."""
     rows = []
     mean, sd = choice.get("mean"), choice.get("sd")
     if "by" in choice and choice["by"] != "plan":
@@ -214,7 +206,7 @@ def choice_rows(choice: dict[str, Any]) -> list[list[str]]:
 
 
 def _how_far(state: LiveSession, block: int) -> str:
-    """Answers of a block, and what the device keeps from being answered."""
+    """Progress of a block: answers, and trials that were skipped or that the device stopped."""
     words = [f"{len(state.answers(block))} of {state.quota(block)}"]
     last, out, excluded = (len(f(block)) for f in (state.put_off, state.skipped, state.excluded))
     words += [f"{last} put off to the end: stopped twice by the device"] if last else []
@@ -224,7 +216,7 @@ def _how_far(state: LiveSession, block: int) -> str:
 
 
 def _set_words(study, values):
-    """Of levels their names; K0 is no parameter, and follows."""
+    """A parameter set as text, levels by their names; K0, which is derived, included."""
     parameters = {p.name: p for p in study.space.parameters}
     return ", ".join(
         f"{name} {parameters[name].words(value)} {parameters[name].unit}".strip()
@@ -248,13 +240,13 @@ def _may(hub):
     actions = ["note", "invite"] + ([] if seen.lost else ["estop"])
     if seen.state in ("HOLD", "ESTOP") and not seen.lost:
         actions.append("clear")
-    if state.screen in ("ended",):
+    if state.screen == "ended":
         return actions
     if state.screen in ("paused", "ready", "rest"):
         actions.append("resume")
     elif state.screen != "done":
         actions.append("pause")
-    answered = any(t.status == "answered" for t in state.trials)
+    answered = state.last_answered is not None
     begun = state.pending is not None and state.pending.step is not None
     actions += ["repeat"] if begun else []
     actions += ["undo"] if answered else []
@@ -264,14 +256,14 @@ def _may(hub):
 
 
 def map_version(state: LiveSession) -> str:
-    """Changes with the answers and the present trial."""
+    """A version of the map, which changes with the answers and the pending trial."""
     answered = sum(1 for t in state.trials if t.status == "answered")
     undone = sum(1 for t in state.trials if t.status in ("undone", "void"))
     return f"{answered}.{undone}.{state.pending.id if state.pending else 0}"
 
 
 def seconds_of(text: str) -> float | None:
-    """A browser's time in s since the epoch; None if it is not one."""
+    """A browser's ISO 8601 time in s since the epoch; None if it is not valid."""
     try:
         seconds = datetime.fromisoformat(text).timestamp()
     except (ValueError, OverflowError, OSError):

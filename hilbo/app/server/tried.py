@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from hilbo.app.interface import Held
+from hilbo.app.interface import HubInterface
 from hilbo.errors import InputError
 from hilbo.study.file.protocols import protocol
 from hilbo.study.file.reading import AnyStudy, StudyFile
@@ -32,13 +32,13 @@ class Tried:
     def __init__(self, study: AnyStudy, reference: Mapping[str, float]):
         self._study, self._reference = study, dict(reference)
 
-    async def facts(self, _hub: Held) -> dict[str, Any]:
+    async def facts(self, _hub: HubInterface) -> dict[str, Any]:
         """What the page presents by."""
         from hilbo.mechanics.exponentials import TABLE
 
         return FIXED | {"reference": self._reference, "table": TABLE[STATES]}
 
-    async def map(self, hub: Held) -> dict[str, Any]:
+    async def map(self, hub: HubInterface) -> dict[str, Any]:
         """The slices of one's own map through its optimum, and each parameter's range, hidden and found value, in the
         study's unit and on [0, 1]. Without slices while they are being prepared, or before the last answer."""
         if hub.state.screen not in ("done", "ended"):

@@ -168,7 +168,7 @@ def record(
 
 
 def _recorded(device: Any, seconds: float, path: Path) -> tuple[int, Exception | None]:
-    """How many samples were written, as they came, and what the device or its line ended that by."""
+    """Write samples as they arrive: their number, and the error of the device or the line that ended it."""
     from hilbo.device.failures import DeviceError
 
     samples, begun, ticks = 0, None, seconds / device.tick_s
@@ -207,10 +207,8 @@ def decode(
             rows.append({"byte": place, "seq": seq, "message": None, "wrong": str(message)})
         else:
             rows.append({"byte": place, "seq": seq, "message": name_of(type(message)), "fields": asdict(message)})
-    words = "\n".join(decoded(row) for row in rows)
-    print_result(
-        json.loads(json.dumps(rows, default=lambda value: value.hex())), words or "The file has no frames.", as_json
-    )
+    words = "\n".join(map(decoded, rows)) or "The file has no frames."
+    print_result(json.loads(json.dumps(rows, default=lambda value: value.hex())), words, as_json)
 
 
 @app.command()
@@ -247,7 +245,8 @@ def simulate(line: Line) -> None:
         device.close()
 
 
-def _begin(device, wanted) -> None:
+def _begin(device: Any, wanted: dict[str, Any] | None) -> None:
+    """Put the set in force, if one is given, and start; a handle in the material has `_LEAVES` s to leave."""
     if wanted is not None:
         print(f"in force: {set_words(device.send(**wanted))}", file=sys.stderr)
     if device.status().contact:
@@ -255,8 +254,8 @@ def _begin(device, wanted) -> None:
     device.start(wait=_LEAVES)
 
 
-def _at_once(line, name, as_json) -> None:
-    """A request that is obeyed before HELLO: nothing else is said first."""
+def _at_once(line: Line, name: str, as_json: bool) -> None:
+    """Send a request that a device obeys before HELLO, with nothing before it."""
     from hilbo.device import protocol
     from hilbo.device.link import Link
     from hilbo.device.ports import open_port

@@ -3,10 +3,9 @@
 Results on stdout, progress on stderr, exit codes as in `device`, which gives these commands their place.
 """
 
-import math
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -63,12 +62,13 @@ def measure_damping(
         reported = device.device.damping_N_s_per_m
     rows = (("damping", "N.s/m"), ("coulomb", "N"), ("mass", "kg"), ("constant", "N"))
     estimates = [(name, getattr(friction, name), unit) for name, unit in rows]
-    content = {name: estimate._asdict() | {"unit": unit} for name, estimate, unit in estimates}
     if friction.added is not None:
-        estimates.append(_added(friction))
-        content[estimates[-1][0]] = friction.added._asdict() | {"unit": estimates[-1][2]}
+        further = ("quadratic", "N.s2/m2") if friction.speed is None else ("stribeck", "N")
+        estimates.append((further[0], friction.added, further[1]))
+    content = {name: estimate._asdict() | {"unit": unit} for name, estimate, unit in estimates}
     words = [f"{name:9} {x.value:9.5f}  {x.lower:9.5f} to {x.upper:9.5f}  {unit}" for name, x, unit in estimates]
-    words.append(f"Friction law that fits the sweeps: {friction.law}{_at(friction.speed)}.")
+    falling = "" if friction.speed is None else f" (falling over {friction.speed:.3g} mm/s)"
+    words.append(f"Friction law that fits the sweeps: {friction.law}{falling}.")
     words.append(f"The device reports {shortest(reported)} N.s/m; {_advice(min(friction.damping.lower, reported))}")
     if reported > friction.damping.upper:
         print("hilbo: the device reports more damping than it has; fix its configuration.", file=sys.stderr)
@@ -83,24 +83,13 @@ def measure_damping(
     print_result(content | rest, "\n".join(words), as_json)
 
 
-def _added(friction: Any) -> tuple[str, Any, str]:
-    """The further term of a law: its name, its estimate, its unit."""
-    if friction.speed is None:
-        return "quadratic", friction.added, "N.s2/m2"
-    return "stribeck", friction.added, "N"
-
-
-def _at(speed: float | None) -> str:
-    """At which speed (mm/s) a Stribeck term has fallen."""
-    return "" if speed is None else f" (falling over {speed:.3g} mm/s)"
-
-
 def _advice(damping: float) -> str:
-    """What studies may count on, which is never more than this (N·s/m)."""
+    """The damping (N·s/m) that studies may assume, rounded down."""
     if damping <= 0:
         return "the measurement does not tell it from 0: measure again, with the handle free, and plan no study before."
-    least = 10.0 ** (math.floor(math.log10(damping)) - 3)
-    return f"plan studies with at most {math.floor(damping / least) * least:.4g}."
+    from hilbo.identification.motor.commissioning import rounded_down
+
+    return f"plan studies with at most {rounded_down(damping):.4g}."
 
 
 @takes(line=Line)

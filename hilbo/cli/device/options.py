@@ -10,7 +10,7 @@ import inspect
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, BinaryIO, NamedTuple
 
 import typer
 
@@ -42,7 +42,7 @@ _Number = float | None
 
 
 class Line(NamedTuple):
-    """Which device, and what is counted on."""
+    """The device, and the damping that it must have."""
 
     device: Where = "sim"
     baud: Baud = 921_600
@@ -104,14 +104,15 @@ def opened(line: Line, **simulated: Any) -> Iterator[Any]:
     """
     from hilbo.hardware_bridge import Renderer
 
+    mechanics = _mechanics(line)
     with contextlib.ExitStack() as stack:
         capture = stack.enter_context(_capture(line.capture)) if line.capture else None
         stack.enter_context(orderly())
         device = stack.enter_context(
             Renderer.open(
                 line.device,
-                damping=_damping(line),
-                delay=None if line.study is None else _mechanics(line).delay,
+                damping=mechanics.damping if mechanics is not None and line.damping is None else line.damping,
+                delay=None if mechanics is None else mechanics.delay,
                 baud=line.baud,
                 patience=line.patience,
                 capture=capture.write if capture else None,
@@ -138,9 +139,7 @@ _OF_A_SET = ("K0", "K1", "B1", "alpha", "N", "T", "memory", "states", "force_lim
 
 def chosen_set(chosen: Chosen, line: Line) -> dict[str, Any] | None:
     """What `Renderer.send` takes, or None where no set is chosen."""
-    options = {"K0": chosen.K0, "K1": chosen.K1, "B1": chosen.B1, "alpha": chosen.alpha, "N": chosen.N, "T": chosen.T}
-    options |= {"memory": chosen.memory, "states": chosen.states, "force_limit": chosen.force_limit}
-    given = {name: value for name, value in options.items() if value is not None}
+    given = {name: value for name in _OF_A_SET if (value := getattr(chosen, name)) is not None}
     if chosen.sets is not None:
         named_sets = sets_of(chosen.sets, line, chosen.K_eff)
         if chosen.name is None and len(named_sets) > 1:
@@ -167,8 +166,8 @@ def sets_of(path: Path, line: Line, K_eff: float | None = None) -> dict[str, dic
     }
 
 
-def _whole(given, line, K_eff) -> dict[str, Any]:
-    """Memory from the study where it is not given, and K0 from the effective stiffness."""
+def _whole(given: dict[str, Any], line: Line, K_eff: float | None) -> dict[str, Any]:
+    """A complete set: memory from the study where it is not given, K0 from the effective stiffness."""
     mechanics = _mechanics(line)
     values = {} if mechanics is None else {n: getattr(mechanics, n) for n in ("N", "T", "memory", "states")}
     values = {"N": 101, "T": 1e-3, "memory": "short"} | values | given
@@ -178,16 +177,14 @@ def _whole(given, line, K_eff) -> dict[str, Any]:
         start()
         from hilbo.viscoelastic import K0_from_effective_stiffness
 
-        if K_eff is None:
-            K_eff = 0.44 if mechanics is None else mechanics.K_eff
-        branch = (given["K1"], given["B1"], given["alpha"])
-        values["K0"] = float(
-            K0_from_effective_stiffness(*branch, K_eff, values["N"], values["T"], memory=values["memory"])
-        )
+        static = (0.44 if mechanics is None else mechanics.K_eff) if K_eff is None else K_eff
+        numbers = {name: values[name] for name in ("K1", "B1", "alpha", "N", "T", "memory")}
+        values["K0"] = float(K0_from_effective_stiffness(**numbers, K_eff=static))
     return values
 
 
-def _mechanics(line) -> Any:
+def _mechanics(line: Line) -> Any:
+    """The mechanics of the study that is given, None without one. Raises `InputError` for a study without any."""
     if line.study is None:
         return None
     from hilbo.study.file.reading import StudyFile
@@ -196,12 +193,6 @@ def _mechanics(line) -> Any:
     if mechanics is None:
         raise InputError(f"{line.study}: has no [renderer], and a device nothing to render.")
     return mechanics
-
-
-def _damping(line) -> float | None:
-    if line.damping is not None or line.study is None:
-        return line.damping
-    return _mechanics(line).damping
 
 
 def sim_options(pairs: list[str] | None) -> dict[str, Any]:
@@ -218,7 +209,8 @@ def sim_options(pairs: list[str] | None) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _capture(path):
+def _capture(path: Path) -> Iterator[BinaryIO]:
+    """A new file for the bytes of the line."""
     try:
         file = open(path, "xb")  # noqa: SIM115
     except OSError as error:

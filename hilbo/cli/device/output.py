@@ -1,10 +1,12 @@
-"""What the commands of `hilbo device` say of devices, their sets and the frames of a capture."""
+"""The text that the commands of `hilbo device` print of devices, parameter sets and frames of a capture."""
+
+from typing import Any
 
 __all__ = ["condition_words", "decoded", "said", "set_words"]
 
 
-def said(name, value) -> str:
-    """A field of HELLO's answer in words."""
+def said(name: str, value: Any) -> str:
+    """A field of the answer to HELLO as text."""
     if name in ("schema", "firmware", "boot_id"):
         return f"{value:08x}"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
@@ -31,7 +33,7 @@ def set_words(current) -> str:
     )
 
 
-def decoded(row) -> str:
+def decoded(row: dict[str, Any]) -> str:
     """A frame of a capture in a line: its byte, its number, its message or what is wrong."""
     seq = "  -" if row["seq"] is None else f"{row['seq']:3}"
     if row["message"] is None:
@@ -40,11 +42,11 @@ def decoded(row) -> str:
     return f"{row['byte']:8} {seq}  {row['message']:12} {fields}"
 
 
-def _field(value) -> str:
+def _field(value: Any) -> str:
     if isinstance(value, bytes):
         return value.hex()
     if isinstance(value, float):
         return f"{value:.7g}"
-    return (
-        " ".join(f"({','.join(map(_field, row))})" for row in value) if isinstance(value, tuple | list) else str(value)
-    )
+    if isinstance(value, tuple | list):
+        return " ".join(f"({','.join(map(_field, row))})" for row in value)
+    return str(value)

@@ -1,10 +1,11 @@
-"""A device on the terminal: its state, its force and position as they go by, and keys that switch between sets.
+"""A device on the terminal: its state, a live trace of force and position, and keys that switch between sets.
 
-Shown on stderr, in place on a terminal, otherwise as a line a second. Keys come from the terminal one by one, or from
-a pipe, one after another, so that what a hand can do a script can do too.
+Shown on stderr: in place on a terminal, otherwise one line a second. Keys come from the terminal, or from a pipe, so
+that scripts can do what a person does.
 """
 
 import contextlib
+import itertools
 import os
 import select
 import sys
@@ -33,6 +34,9 @@ _SHOWN = 4.0  # s of the trace
 _BARS = " ▁▂▃▄▅▆▇█"
 _KEYS = "123456789"
 _PIPED = 5  # pictures from one key of a pipe to the next
+_REPORTED = (
+    *("tick", "position_mm", "force_N", "holds", "estops", "saturated", "slewed", "overruns", "frames_dropped"),
+)
 
 
 def trace(values: Any, width: int) -> str:
@@ -104,37 +108,22 @@ class _View:
         return Group(Text(self.title), table, *(Text(word) for word in self.words[-4:]))
 
     def summary(self) -> dict[str, Any]:
-        """For `--json`."""
-        s = self.status
-        names = (
-            "tick",
-            "position_mm",
-            "force_N",
-            "holds",
-            "estops",
-            "saturated",
-            "slewed",
-            "overruns",
-            "frames_dropped",
-        )
-        counts = self.device.counts()._asdict()
-        rest = {
+        """The content for `--json`."""
+        status = self.status
+        return {
+            "state": meaning(State, status.state),
+            **{name: getattr(status, name) for name in _REPORTED},
             "samples": self.seen,
             "largest_force_N": self.largest_N,
             "set": self.set._asdict() if self.set else None,
             **self.device.condition()._asdict(),
-        }
-        return {
-            "state": meaning(State, s.state),
-            **{name: getattr(s, name) for name in names},
-            **rest,
-            "counts": counts,
+            "counts": self.device.counts()._asdict(),
         }
 
 
 def watch(device: Renderer, seconds: float | None, title: str = "Ctrl-C ends") -> dict[str, Any]:
     """Show the device until Ctrl-C, for so many `seconds` of its time, or until it is in HOLD; returns a summary."""
-    return _show(_View(device, title), seconds, lambda _view: True)
+    return _show(_View(device, title), seconds, lambda: True)
 
 
 def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float | None) -> dict[str, Any]:
@@ -156,21 +145,25 @@ def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float
             if device.link.lost:
                 raise
 
-    def go_on(keys: Iterator[str]) -> bool:
-        for key in keys:
-            if key == "q":
-                return False
-            obey(partial(_press, device, view, key, names, sets, felt))
-        if view.start_after is not None:
-            obey(partial(_start_when_free, device, view))
-        return True
-
     with _keyboard() as pressed:
-        content = _show(view, seconds, lambda _view: go_on(pressed()))
+
+        def go_on() -> bool:
+            for key in pressed():
+                if key == "q":
+                    return False
+                obey(partial(_press, device, view, key, names, sets, felt))
+            if view.start_after is not None:
+                obey(partial(_start_when_free, device, view))
+            return True
+
+        content = _show(view, seconds, go_on)
     return content | {"felt": felt, "words": view.words}
 
 
-def _press(device, view, key, names, sets, felt) -> None:
+def _press(
+    device: Renderer, view: _View, key: str, names: list[str], sets: Mapping[str, Mapping[str, Any]], felt: list[str]
+) -> None:
+    """Carry out a key; the name of a set that it puts in force is appended to `felt`."""
     if key in _KEYS[: len(names)]:
         name = names[_KEYS.index(key)]
         view.set = device.send(**sets[name])
@@ -190,7 +183,7 @@ def _press(device, view, key, names, sets, felt) -> None:
         device.clear()
 
 
-def _start_when_free(device, view) -> None:
+def _start_when_free(device: Renderer, view: _View) -> None:
     """Start what the space bar asked for, unless the handle is still in the material."""
     stop, view.start_after = view.start_after, None
     try:
@@ -201,7 +194,8 @@ def _start_when_free(device, view) -> None:
         view.start_after = stop
 
 
-def _show(view, seconds, go_on: Callable[[_View], bool]) -> dict[str, Any]:
+def _show(view: _View, seconds: float | None, go_on: Callable[[], bool]) -> dict[str, Any]:
+    """Update the view until `go_on` returns False, or for so many `seconds` of the device's time."""
     console = Console(stderr=True, highlight=False, markup=False)
     first, painted = view.status.tick, 0.0
     with contextlib.ExitStack() as stack:
@@ -215,7 +209,7 @@ def _show(view, seconds, go_on: Callable[[_View], bool]) -> dict[str, Any]:
                     console.print(view.line())
                     painted = time.monotonic()
                 over = seconds is not None and (view.status.tick - first) % 2**32 * view.device.tick_s >= seconds
-                if over or not go_on(view):
+                if over or not go_on():
                     break
                 view.device.link.pause(_PAINT)
     if live is None:
@@ -226,9 +220,11 @@ def _show(view, seconds, go_on: Callable[[_View], bool]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _keyboard() -> Iterator[Callable[[], Iterator[str]]]:
-    """A function that gives the keys pressed since the last call, without waiting; "q" at the end of a pipe."""
+    """A function that returns the keys pressed since the last call, without waiting; of a pipe one key every half a
+    second, and "q" at its end."""
     if not sys.stdin.isatty():
-        yield _Pipe()
+        calls = itertools.count()
+        yield lambda: iter("" if next(calls) % _PIPED else sys.stdin.read(1) or "q")
         return
     try:
         import termios
@@ -244,21 +240,10 @@ def _keyboard() -> Iterator[Callable[[], Iterator[str]]]:
         termios.tcsetattr(file, termios.TCSADRAIN, before)
 
 
-def _waiting(file) -> Iterator[str]:
+def _waiting(file: int) -> Iterator[str]:
+    """The keys that wait in a terminal."""
     while select.select([file], [], [], 0)[0]:
         data = os.read(file, 1)
         if not data:
             return
         yield data.decode(errors="replace")
-
-
-class _Pipe:
-    """Keys from a pipe, one every half a second."""
-
-    def __init__(self):
-        self._asked = 0
-
-    def __call__(self) -> Iterator[str]:
-        self._asked += 1
-        if self._asked % _PIPED == 1:
-            yield sys.stdin.read(1) or "q"

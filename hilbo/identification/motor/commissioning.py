@@ -19,7 +19,17 @@ from hilbo.hardware_bridge import Capability, DeviceError, RefusalError, Rendere
 from hilbo.identification.motor.device_tests import drive, measure_damping, wait_until
 from hilbo.identification.motor.friction import Friction
 
-__all__ = ["Bounds", "Commissioned", "Nudge", "Person", "commission", "damping_for", "delay_for", "find_signs"]
+__all__ = [
+    "Bounds",
+    "Commissioned",
+    "Nudge",
+    "Person",
+    "commission",
+    "damping_for",
+    "delay_for",
+    "find_signs",
+    "rounded_down",
+]
 
 _FEWEST = 2  # encoder steps of a movement whose direction counts
 _STILL, _REST = 0.3, 10.0  # s without movement before a nudge, and how long to wait for them
@@ -165,7 +175,7 @@ def _check_encoder(device: Renderer) -> None:
 
     moved = wait_until(device, pushed, f"seen a push by hand of {enough:g} mm", _PATIENCE)
     if moved < 0:
-        _end_for_good(device)
+        device.estop()
         raise DeviceError(
             f"{device.link.name}: the encoder counts the wrong way: pushed in, its position fell by {-moved:.2f} mm;"
             " swap its channels A and B, or change encoder_sign in the device's header, then commission again."
@@ -186,7 +196,7 @@ def _first_that_moves(device: Renderer, say: Callable[[str], None], bounds: Boun
             continue
         if nudge.moved_mm * sign > 0:
             return nudge
-        _end_for_good(device)
+        device.estop()
         raise DeviceError(
             f"{device.link.name}: the motor pushes the wrong way: {force:.2g} N {way} moved the handle by"
             f" {abs(nudge.moved_mm):.2f} mm the other way; swap the motor's two wires, or change motor_sign in the"
@@ -232,11 +242,6 @@ def _rests(device: Renderer) -> float:
     return wait_until(device, position, "come to rest by itself with its motor at rest", _REST)[0]
 
 
-def _end_for_good(device: Renderer) -> None:
-    """Latch the emergency stop: nothing moves until somebody clears it."""
-    device.estop()
-
-
 def _home(device: Renderer, person: Person, moved_mm: float) -> None:
     position = person.place(moved_mm)
     if position is not None:
@@ -275,8 +280,10 @@ def delay_for(longest_us: int) -> int:
 def damping_for(friction: Friction) -> float:
     """Damping (N·s/m) for a header: the lower end of the interval, rounded down to four digits; 0 where it is not
     above 0."""
-    lower = friction.damping.lower
-    if not lower > 0:
-        return 0.0
-    least = 10.0 ** (math.floor(math.log10(lower)) - 3)
-    return math.floor(lower / least) * least
+    return rounded_down(friction.damping.lower) if friction.damping.lower > 0 else 0.0
+
+
+def rounded_down(value: float) -> float:
+    """A positive number rounded down to four digits."""
+    least = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return math.floor(value / least) * least

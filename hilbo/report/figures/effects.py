@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import BLUE, ORANGE, RED, STYLE, label_axes
+from hilbo.report.figures.style import BLUE, ORANGE, RED, label_axes, new_figure, styled
 from hilbo.study.analysis.effects import Effect
 from hilbo.study.config import Study
 
@@ -16,24 +15,23 @@ __all__ = ["effects_figure"]
 _ACROSS = 4  # panels in a row
 
 
+@styled
 def effects_figure(study: Study, effects: Sequence[Effect], optimum: Float[np.ndarray, " d"]) -> Figure:
     """For each parameter the map along the slice through the optimum, with its standard deviation, and the main effect;
     all on one scale. Whole numbers and levels are points."""
     rows, across = -(-len(effects) // _ACROSS), min(len(effects), _ACROSS)
     best = np.asarray(study.space.to_physical(np.asarray(optimum)))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(1.2 + 2.0 * across, 0.5 + 1.9 * rows), layout="constrained")
-        grid = np.atleast_2d(figure.subplots(rows, across, sharey=True, squeeze=False))
-        for axes in grid.ravel()[len(effects) :]:
-            axes.remove()
-        for i, (axes, effect) in enumerate(zip(grid.ravel(), effects, strict=False)):
-            label_axes(axes, study, i, i)
-            axes.set(yscale="linear", ylabel=f"{study.attribute} f" if i % across == 0 else "")
-            _draw(axes, effect, study.space.parameters[i].discrete, best[i])
-        for axes in grid.ravel()[: len(effects)]:
-            axes.autoscale(axis="y")
-        labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(*labels, loc="outside upper center", ncols=3, frameon=False)
+    figure, grid = new_figure(1.2 + 2.0 * across, 0.5 + 1.9 * rows, rows, across, sharey=True, squeeze=False)
+    for axes in grid.ravel()[len(effects) :]:
+        axes.remove()
+    for i, (axes, effect) in enumerate(zip(grid.ravel(), effects, strict=False)):
+        label_axes(axes, study, i, i)
+        axes.set(yscale="linear", ylabel=f"{study.attribute} f" if i % across == 0 else "")
+        _draw(axes, effect, study.space.parameters[i].discrete, best[i])
+    for axes in grid.ravel()[: len(effects)]:
+        axes.autoscale(axis="y")
+    labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*labels, loc="outside upper center", ncols=3, frameon=False)
     return figure
 
 

@@ -8,10 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -26,13 +25,14 @@ from hilbo.report.figures.style import (
     ONE_COLUMN,
     ORANGE,
     RED,
-    STYLE,
     TWO_COLUMNS,
     few_ticks,
     label_axes,
     legend,
     level_words,
+    new_figure,
     star,
+    styled,
     title,
 )
 from hilbo.study.analysis.progress import Progress
@@ -41,7 +41,9 @@ from hilbo.study.config import Study
 from hilbo.study.estimate.optimum import predict_map
 
 __all__ = [
+    "Plane",
     "Slice",
+    "draw_curve",
     "grid_slice",
     "map_handles",
     "map_panels",
@@ -49,7 +51,7 @@ __all__ = [
     "maps_beside",
     "moved_optima",
     "optima_scatter",
-    "sides",
+    "plane",
     "slices_after",
 ]
 
@@ -63,10 +65,12 @@ Surface = Callable[..., tuple[Any, Any]]
 
 
 class Slice(NamedTuple):
-    """Mean and standard deviation (r, c) of a map over the first two parameters, NaN where nothing may be rendered."""
+    """Mean and standard deviation (r, c) of a map over the first two parameters, NaN where not feasible; and the
+    physical values of these parameters (c,) and (r,)."""
 
     mean: Float[np.ndarray, "r c"]
     sd: Float[np.ndarray, "r c"]
+    sides: tuple[np.ndarray, np.ndarray]
 
 
 def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
@@ -115,46 +119,38 @@ def maps_beside(study: Study, maps: Mapping[str, Surface], optima: Float[np.ndar
     return figure
 
 
+@styled
 def moved_optima(names: Sequence[str], moves: Float[ArrayLike, " M"], population_move: float, limit: float) -> Figure:
     """How far everybody's own optimum moved (dots, in order) and the population's (line), in % of the search ranges."""
     percent = 100 * np.asarray(moves)
     order, rows = np.argsort(percent), np.arange(len(percent))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(ONE_COLUMN, 1.2 + 0.14 * len(percent)), layout="constrained")
-        axes = figure.subplots()
-        axes.scatter(percent[order], rows, s=20, color=np.where(percent[order] < 100 * limit, BLUE, ORANGE), zorder=3)
-        axes.axvline(100 * population_move, color=RED, label="population map")
-        axes.axvline(100 * limit, color=GREY, linestyle="--", linewidth=1, label=f"flagged from {100 * limit:g} %")
-        axes.set_yticks(rows, [names[int(i)] for i in order], fontsize=7)
-        axes.set(xlabel="NRMSE between the optima (%)", xlim=(0, None), ylim=(-0.7, len(percent) - 0.3))
-        legend(figure, axes.get_legend_handles_labels()[0])
+    figure, axes = new_figure(ONE_COLUMN, 1.2 + 0.14 * len(percent))
+    axes.scatter(percent[order], rows, s=20, color=np.where(percent[order] < 100 * limit, BLUE, ORANGE), zorder=3)
+    axes.axvline(100 * population_move, color=RED, label="population map")
+    axes.axvline(100 * limit, color=GREY, linestyle="--", linewidth=1, label=f"flagged from {100 * limit:g} %")
+    axes.set_yticks(rows, [names[int(i)] for i in order], fontsize=7)
+    axes.set(xlabel="NRMSE between the optima (%)", xlim=(0, None), ylim=(-0.7, len(percent) - 0.3))
+    legend(figure, axes.get_legend_handles_labels()[0])
     return figure
 
 
+@styled
 def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[str, Float[np.ndarray, " d"]]) -> Figure:
     """Everybody's own optimum, pair by pair of parameters, with named points (the population optimum, ...)."""
     d = study.space.dim
     pairs = [(0, 1), (0, 2), (1, 2)] if d > 2 else [(0, d - 1)]
     physical = np.asarray(study.space.to_physical(optima))
-    points = {name: np.asarray(study.space.to_physical(x)) for name, x in marks.items()}
     styles = (("*", RED, 140), ("X", ORANGE, 60), ("P", "black", 60), ("D", GREEN, 40))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(TWO_COLUMNS if len(pairs) > 1 else ONE_COLUMN, 2.7), layout="constrained")
-        for axes, (i, j) in zip(_row(figure, len(pairs)), pairs, strict=True):
-            axes.scatter(
-                physical[:, i], physical[:, j], s=20, color=BLUE, alpha=0.7, label="individuals", clip_on=False
-            )
-            for (name, point), (marker, colour, size) in zip(points.items(), styles, strict=False):
-                look = {"marker": marker, "s": size, "color": colour, "edgecolor": "white", "linewidth": 0.6}
-                axes.scatter(point[i], point[j], label=name, zorder=3, clip_on=False, **look)
-            label_axes(axes, study, i, j)
-        labels = figure.axes[0].get_legend_handles_labels()
-        legend(figure, labels[0])
+    figure, panels = new_figure(TWO_COLUMNS if len(pairs) > 1 else ONE_COLUMN, 2.7, 1, len(pairs), squeeze=False)
+    for axes, (i, j) in zip(panels[0], pairs, strict=True):
+        axes.scatter(physical[:, i], physical[:, j], s=20, color=BLUE, alpha=0.7, label="individuals", clip_on=False)
+        for (name, x), (marker, colour, size) in zip(marks.items(), styles, strict=False):
+            point = np.asarray(study.space.to_physical(x))
+            look = {"marker": marker, "s": size, "color": colour, "edgecolor": "white", "linewidth": 0.6}
+            axes.scatter(point[i], point[j], label=name, zorder=3, clip_on=False, **look)
+        label_axes(axes, study, i, j)
+    legend(figure, panels[0, 0].get_legend_handles_labels()[0])
     return figure
-
-
-def _row(figure, count):
-    return np.atleast_1d(figure.subplots(1, count))
 
 
 def _levels(parameter, third):
@@ -174,33 +170,31 @@ def _levels(parameter, third):
     return sorted((third, *beside))
 
 
+@styled
 def map_panels(study: Study, grids):
     """A figure with a panel for each grid, and what draws a grid on one, all on one colour scale."""
     heights = np.concatenate([g.mean.ravel() for g in grids])
     low, high = np.nanmin(heights), np.nanmax(heights)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(ONE_COLUMN, 2.9) if len(grids) == 1 else (TWO_COLUMNS, 2.6), layout="constrained")
-        panels = np.atleast_1d(figure.subplots(1, len(grids), sharey=True))
-        scale = ScalarMappable(Normalize(low, high), "cividis")
-        bar = figure.colorbar(scale, ax=list(panels), label=f"{study.attribute} f", fraction=0.05, pad=0.02)
-        few_ticks(bar.ax.yaxis, 5)
-        for axes in panels:
-            label_axes(axes, study, 0, 1)
-        for axes in panels[1:]:
-            axes.set_ylabel("")
+    size = (ONE_COLUMN, 2.9) if len(grids) == 1 else (TWO_COLUMNS, 2.6)
+    figure, ((*panels,),) = new_figure(*size, 1, len(grids), sharey=True, squeeze=False)
+    scale = ScalarMappable(Normalize(low, high), "cividis")
+    bar = figure.colorbar(scale, ax=panels, label=f"{study.attribute} f", fraction=0.05, pad=0.02)
+    few_ticks(bar.ax.yaxis, 5)
+    for axes in panels:
+        label_axes(axes, study, 0, 1)
+    for axes in panels[1:]:
+        axes.set_ylabel("")
 
     def draw(axes, values):
-        first, second = sides(study)
-        mean, sd = values
-        axes.pcolormesh(first, second, mean, cmap="cividis", norm=scale.norm, shading="nearest", rasterized=True)
-        if np.isnan(mean).all() or min(mean.shape) < 2:  # nothing may be rendered, or nothing is between the steps
-            return
-        if not _has_lines(study):
+        mean, sd, sides = values
+        axes.pcolormesh(*sides, mean, cmap="cividis", norm=scale.norm, shading="nearest", rasterized=True)
+        # Nothing may be rendered, or nothing is between the steps.
+        if np.isnan(mean).all() or min(mean.shape) < 2 or not _has_lines(study):
             return
         if np.nanmax(mean) > np.nanmin(mean):
-            axes.contour(first, second, mean, levels=_MEANS, colors="white", linewidths=0.4, linestyles="solid")
+            axes.contour(*sides, mean, levels=_MEANS, colors="white", linewidths=0.4, linestyles="solid")
         if np.nanmax(sd) > np.nanmin(sd):
-            lines = axes.contour(first, second, sd, levels=_SDS, colors="black", linewidths=0.7, linestyles="dotted")
+            lines = axes.contour(*sides, sd, levels=_SDS, colors="black", linewidths=0.7, linestyles="dotted")
             axes.clabel(lines, fmt="%.2g", fontsize=6)
 
     return figure, panels, draw
@@ -219,22 +213,38 @@ def map_handles(study: Study) -> list[Any]:
     return [white, Line2D([], [], color="black", linewidth=0.8, linestyle="dotted", label="standard deviation")]
 
 
-def sides(study: Study) -> list[np.ndarray]:
-    """Physical values of the first two parameters along a slice."""
-    return [np.asarray(p.to_physical(p.axis(_CELLS))) for p in study.space.parameters[:2]]
+class Plane(NamedTuple):
+    """A grid over two parameters, rows upwards: its `points` (r * c, d) of the unit cube, the physical values of both
+    parameters (c,) and (r,), and which points are feasible (r, c)."""
+
+    points: Float[np.ndarray, "rc d"]
+    sides: tuple[np.ndarray, np.ndarray]
+    feasible: Bool[np.ndarray, "r c"]
+
+    def image(self, values: ArrayLike) -> Float[np.ndarray, "r c"]:
+        """Values of the points (r * c,) on the grid, NaN where a point is not feasible."""
+        return np.where(self.feasible, np.asarray(values).reshape(self.feasible.shape), np.nan)
+
+
+def plane(study: Study, point: Float[ArrayLike, " d"], pair: tuple[int, int] = (0, 1), cells: int = _CELLS) -> Plane:
+    """The grid over a pair of parameters on which the others are as in `point` (d,) of the unit cube."""
+    searched = [study.space.parameters[k] for k in pair]
+    axes = [p.axis(cells) for p in searched]
+    grid = np.tile(np.asarray(point, float), (len(axes[1]), len(axes[0]), 1))
+    grid[..., pair[0]], grid[..., pair[1]] = np.meshgrid(*axes)
+    points = grid.reshape(-1, grid.shape[-1])
+    across, up = (np.asarray(p.to_physical(axis)) for p, axis in zip(searched, axes, strict=True))
+    return Plane(points, (across, up), np.asarray(study.space.feasible(points)).reshape(grid.shape[:-1]))
 
 
 def grid_slice(study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], third: float | None) -> Slice:
     """A map over the first two parameters, at `third` of the third; `optimum` (d,): where the others stay."""
-    first, second = (p.axis(_CELLS) for p in study.space.parameters[:2])
-    x = np.tile(np.asarray(optimum, float), (len(second), len(first), 1))
-    x[..., 0], x[..., 1] = np.meshgrid(first, second)
+    point = np.array(optimum, float)
     if third is not None:
-        x[..., 2] = third
-    flat = x.reshape(-1, x.shape[-1])
-    feasible = np.asarray(study.space.feasible(flat))
-    mean, variance = (np.where(feasible, np.asarray(m), np.nan).reshape(x.shape[:-1]) for m in surface(to_device(flat)))
-    return Slice(mean, np.sqrt(variance))
+        point[2] = third
+    grid = plane(study, point)
+    mean, variance = map(grid.image, surface(to_device(grid.points)))
+    return Slice(mean, np.sqrt(variance), grid.sides)
 
 
 def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -244,38 +254,41 @@ def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.n
     return np.asarray(study.space.parameters[0].to_physical(side)), np.asarray(mean), np.sqrt(np.asarray(variance))
 
 
-def _curve_axes(study):
-    figure = Figure(figsize=(ONE_COLUMN, 2.5), layout="constrained")
-    axes = figure.subplots()
+def label_curve(axes, study: Study) -> None:
+    """Axes of a map of one parameter."""
     label_axes(axes, study, 0, 0)
     axes.set(yscale="linear", ylabel=f"{study.attribute} f")
-    return figure, axes
 
 
+def draw_curve(axes, study: Study, curve: Sequence[np.ndarray], sd_label: str = "", label: str = "") -> None:
+    """A map of one parameter with its standard deviation: physical values, mean, and standard deviation (m,)."""
+    physical, mean, sd = curve
+    label_curve(axes, study)
+    axes.fill_between(physical, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0, label=sd_label)
+    axes.plot(physical, mean, color=BLUE, label=label)
+    axes.autoscale(axis="y")
+
+
+@styled
 def _map_curve(study, surface, optimum, cohort):
-    with mpl.rc_context(STYLE):
-        figure, axes = _curve_axes(study)
-        physical, mean, sd = _curve(study, surface)
-        axes.fill_between(
-            physical, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0, label="± standard deviation"
-        )
-        axes.plot(physical, mean, color=BLUE, label="population map")
-        axes.autoscale(axis="y")
-        counts = mark_along(axes, study, cohort)
-        best = np.asarray(study.space.to_physical(np.asarray(optimum)))[0]
-        axes.axvline(float(best), color=RED, linewidth=1, label="optimum")
-        legend(figure, [*axes.get_legend_handles_labels()[0], *answer_handles(study, counts, discs=False)])
+    figure, axes = new_figure(ONE_COLUMN, 2.5)
+    draw_curve(axes, study, _curve(study, surface), "± standard deviation", "population map")
+    counts = mark_along(axes, study, cohort)
+    best = np.asarray(study.space.to_physical(np.asarray(optimum)))[0]
+    axes.axvline(float(best), color=RED, linewidth=1, label="optimum")
+    legend(figure, [*axes.get_legend_handles_labels()[0], *answer_handles(study, counts, discs=False)])
     return figure
 
 
+@styled
 def _curves_beside(study, maps, optima):
-    with mpl.rc_context(STYLE):
-        figure, axes = _curve_axes(study)
-        for (name, surface), x, colour in zip(maps.items(), optima, (ORANGE, GREEN, BLUE, RED), strict=False):
-            physical, mean, _ = _curve(study, surface)
-            axes.plot(physical, mean, color=colour, label=name)
-            best = float(np.asarray(study.space.to_physical(np.asarray(x)))[0])
-            axes.plot(best, np.interp(best, physical, mean), "*", color=colour, markersize=11, markeredgecolor="white")
-        axes.autoscale(axis="y")
-        axes.legend(frameon=False)
+    figure, axes = new_figure(ONE_COLUMN, 2.5)
+    label_curve(axes, study)
+    for (name, surface), x, colour in zip(maps.items(), optima, (ORANGE, GREEN, BLUE, RED), strict=False):
+        physical, mean, _ = _curve(study, surface)
+        axes.plot(physical, mean, color=colour, label=name)
+        best = float(np.asarray(study.space.to_physical(np.asarray(x)))[0])
+        axes.plot(best, np.interp(best, physical, mean), "*", color=colour, markersize=11, markeredgecolor="white")
+    axes.autoscale(axis="y")
+    axes.legend(frameon=False)
     return figure

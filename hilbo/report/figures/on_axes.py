@@ -8,13 +8,13 @@ draw_map(study, aggregate, ("K1", "alpha"), ax=axes[1])
 from typing import Any
 
 import jax.numpy as jnp
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Posterior
-from hilbo.report.figures.maps import BLUE, STYLE, label_axes, level_words, star
+from hilbo.report.figures.maps import draw_curve, plane
+from hilbo.report.figures.style import label_axes, level_words, star, styled
 from hilbo.search.candidates import search_points
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate
@@ -25,6 +25,7 @@ __all__ = ["draw_map"]
 _CELLS = 61
 
 
+@styled
 def draw_map(
     study: Study, model: Posterior | Aggregate, pair: tuple[str, str] | None = None, *, ax: Axes | None = None
 ) -> Axes:
@@ -40,22 +41,20 @@ def draw_map(
     title. Raises `InputError` for parameters that the study does not have.
     """
     names = study.space.names
-    with mpl.rc_context(STYLE):
-        axes = _new_axes() if ax is None else ax
-        best = _maximum(study, model)
-        if len(names) == 1 and pair is None:
-            _curve(axes, study, model)
-            return axes
-        i, j = _places(names, names[:2] if pair is None else pair)
-        mean = _slice(study, model, best, i, j)
-        searched = (study.space.parameters[k] for k in (i, j))
-        sides = [np.asarray(p.to_physical(jnp.asarray(p.axis(_CELLS)))) for p in searched]
-        drawn = axes.pcolormesh(*sides, mean, cmap="cividis", shading="nearest", rasterized=True)
-        axes.figure.colorbar(drawn, ax=axes, label=f"{study.attribute} f (mean)")
-        label_axes(axes, study, i, j)
-        star(axes, study, best, (i, j))
-        held = [level_words(study, k, float(best[k])) for k in range(len(names)) if k not in (i, j)]
-        axes.set_title(", ".join(held))
+    axes = _new_axes() if ax is None else ax
+    best = _maximum(study, model)
+    if len(names) == 1 and pair is None:
+        _curve(axes, study, model)
+        return axes
+    i, j = _places(names, names[:2] if pair is None else pair)
+    grid = plane(study, best, (i, j), _CELLS)
+    mean = grid.image(_mean_and_variance(model, grid.points)[0])
+    drawn = axes.pcolormesh(*grid.sides, mean, cmap="cividis", shading="nearest", rasterized=True)
+    axes.figure.colorbar(drawn, ax=axes, label=f"{study.attribute} f (mean)")
+    label_axes(axes, study, i, j)
+    star(axes, study, best, (i, j))
+    held = [level_words(study, k, float(best[k])) for k in range(len(names)) if k not in (i, j)]
+    axes.set_title(", ".join(held))
     return axes
 
 
@@ -85,22 +84,8 @@ def _mean_and_variance(model: Any, x: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.asarray(mean), np.asarray(variance)
 
 
-def _slice(study: Study, model: Any, best: np.ndarray, i: int, j: int) -> np.ndarray:
-    """The mean on a grid (rows: up), NaN where nothing may be rendered."""
-    across, up = (study.space.parameters[k].axis(_CELLS) for k in (i, j))
-    x = np.tile(best, (len(up), len(across), 1))
-    x[..., i], x[..., j] = np.meshgrid(across, up)
-    flat = x.reshape(-1, len(best))
-    mean = _mean_and_variance(model, flat)[0]
-    return np.where(np.asarray(study.space.feasible(jnp.asarray(flat))), mean, np.nan).reshape(x.shape[:-1])
-
-
 def _curve(axes: Axes, study: Study, model: Any) -> None:
     side = np.linspace(0.0, 1.0, _CELLS)
     mean, variance = _mean_and_variance(model, side[:, None])
-    physical, sd = np.asarray(study.space.parameters[0].to_physical(jnp.asarray(side))), np.sqrt(variance)
-    axes.fill_between(physical, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0)
-    axes.plot(physical, mean, color=BLUE)
-    label_axes(axes, study, 0, 0)
-    axes.set(yscale="linear", ylabel=f"{study.attribute} f")
-    axes.autoscale(axis="y")
+    physical = np.asarray(study.space.parameters[0].to_physical(jnp.asarray(side)))
+    draw_curve(axes, study, (physical, mean, np.sqrt(variance)))

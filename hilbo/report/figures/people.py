@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
@@ -13,58 +12,50 @@ from hilbo.report.figures.style import (
     GREY,
     ONE_COLUMN,
     RED,
-    STYLE,
     TWO_COLUMNS,
     legend,
+    new_figure,
+    styled,
 )
 
 __all__ = ["people_figure", "predictive_check"]
 
 
+@styled
 def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
     """Consistency, lapse rate and drift of every participant: a line for the 95 % interval, a mark for the estimate if
     there is one; red crosses: left out."""
     rows = np.arange(len(people))[::-1]
     out = people["participant"].isin(list(left_out)).to_numpy()
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(TWO_COLUMNS, 1.2 + 0.14 * max(len(people), 4)), layout="constrained")
-        panels = figure.subplots(1, 3, sharey=True)
-        words = ("agreement of repeats", "lapse rate", "drift (prior standard deviations)")
-        for axes, measure, label in zip(panels, ("consistency", "lapse", "drift"), words, strict=True):
-            value, low, high = (people[f"{measure}{end}"].to_numpy(float) for end in ("", "_low", "_high"))
-            limits = (-3.5, 3.5) if measure == "drift" else (-0.03, 1.03)
-            for part, color, mark in ((~out, BLUE, {"s": 16}), (out, RED, {"s": 26, "marker": "x"})):
-                ends = np.maximum(low[part], limits[0]), np.minimum(high[part], limits[1])
-                axes.hlines(rows[part], *ends, color=color, linewidth=1)
-                known = part & np.isfinite(value)
-                axes.scatter(value[known], rows[known], color=color, zorder=3, **mark)
-            axes.set(xlabel=label, xlim=limits)
-        panels[2].axvline(0, color=GREY, linestyle="--", linewidth=1)
-        panels[0].set_yticks(rows, list(people["participant"]), fontsize=6)
+    figure, panels = new_figure(TWO_COLUMNS, 1.2 + 0.14 * max(len(people), 4), 1, 3, sharey=True)
+    words = ("agreement of repeats", "lapse rate", "drift (prior standard deviations)")
+    for axes, measure, label in zip(panels, ("consistency", "lapse", "drift"), words, strict=True):
+        value, low, high = (people[f"{measure}{end}"].to_numpy(float) for end in ("", "_low", "_high"))
+        limits = (-3.5, 3.5) if measure == "drift" else (-0.03, 1.03)
+        for part, color, mark in ((~out, BLUE, {"s": 16}), (out, RED, {"s": 26, "marker": "x"})):
+            ends = np.maximum(low[part], limits[0]), np.minimum(high[part], limits[1])
+            axes.hlines(rows[part], *ends, color=color, linewidth=1)
+            known = part & np.isfinite(value)
+            axes.scatter(value[known], rows[known], color=color, zorder=3, **mark)
+        axes.set(xlabel=label, xlim=limits)
+    panels[2].axvline(0, color=GREY, linestyle="--", linewidth=1)
+    panels[0].set_yticks(rows, list(people["participant"]), fontsize=6)
     return figure
 
 
+@styled
 def predictive_check(
     responses: Sequence[str], observed: Float[np.ndarray, " C"], predicted: Float[np.ndarray, "draws C"]
 ) -> Figure:
     """Shares of the answers given, and of those that the posterior would give again."""
     positions = np.arange(len(responses))
     low, middle, high = 100 * np.percentile(predicted, [2.5, 50, 97.5], axis=0)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(ONE_COLUMN, 2.5), layout="constrained")
-        axes = figure.subplots()
-        axes.bar(
-            positions,
-            100 * observed,
-            width=0.6,
-            color="#c9d9e8",
-            edgecolor="black",
-            linewidth=0.6,
-            label="answers given",
-        )
-        axes.vlines(positions, low, high, color=RED, linewidth=2)
-        axes.scatter(positions, middle, s=26, color=RED, zorder=3, label="would be given again")
-        axes.set_xticks(positions, list(responses))
-        axes.set(ylabel="share of the answers (%)", ylim=(0, None))
-        legend(figure, axes.get_legend_handles_labels()[0])
+    figure, axes = new_figure(ONE_COLUMN, 2.5)
+    look = {"width": 0.6, "color": "#c9d9e8", "edgecolor": "black", "linewidth": 0.6}
+    axes.bar(positions, 100 * observed, label="answers given", **look)
+    axes.vlines(positions, low, high, color=RED, linewidth=2)
+    axes.scatter(positions, middle, s=26, color=RED, zorder=3, label="would be given again")
+    axes.set_xticks(positions, list(responses))
+    axes.set(ylabel="share of the answers (%)", ylim=(0, None))
+    legend(figure, axes.get_legend_handles_labels()[0])
     return figure

@@ -4,12 +4,21 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import BLUE, GREY, ONE_COLUMN, ORANGE, STYLE, TWO_COLUMNS, few_ticks, label_axes
+from hilbo.report.figures.style import (
+    BLUE,
+    GREY,
+    ONE_COLUMN,
+    ORANGE,
+    TWO_COLUMNS,
+    few_ticks,
+    label_axes,
+    new_figure,
+    styled,
+)
 from hilbo.study.config import Study
 
 __all__ = ["coverage_figure", "reliability_figure", "rules_figure"]
@@ -17,52 +26,43 @@ __all__ = ["coverage_figure", "reliability_figure", "rules_figure"]
 _CELLS = 61
 
 
+@styled
 def rules_figure(content: dict[str, Any]) -> Figure:
     """Out-of-sample prediction by every rule: how much worse than the best (density; bars: two standard errors of the
     paired difference), and the share within the central 95 %."""
     rules = {rule: entry for rule, entry in content["rules"].items() if "negative_log_density" in entry}
     order = sorted(rules, key=lambda rule: -rules[rule]["negative_log_density"])
     rows = np.arange(len(order))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(TWO_COLUMNS, 0.9 + 0.24 * len(order)), layout="constrained")
-        left, right = figure.subplots(1, 2, sharey=True)
-        for axes, key, scale, bars in ((left, "difference", 1.0, 2.0), (right, "central_95", 100.0, 1.0)):
-            values = np.array([scale * rules[rule][key] for rule in order])
-            errors = bars * scale * np.array([rules[rule][f"{key}_error"] for rule in order])
-            axes.errorbar(values, rows, xerr=errors, fmt="o", color=BLUE, ecolor=GREY, markersize=4, linewidth=1)
-            few_ticks(axes.xaxis, 5)
-        left.axvline(0, color=ORANGE, linewidth=1)
-        right.axvline(95, color=ORANGE, linewidth=1)
-        left.set_yticks(rows, order)
-        left.set_xlabel("worse than the best rule by (nats an answer)")
-        right.set_xlabel("answers in the central 95 % (%)")
+    figure, (left, right) = new_figure(TWO_COLUMNS, 0.9 + 0.24 * len(order), 1, 2, sharey=True)
+    for axes, key, scale, bars in ((left, "difference", 1.0, 2.0), (right, "central_95", 100.0, 1.0)):
+        values = np.array([scale * rules[rule][key] for rule in order])
+        errors = bars * scale * np.array([rules[rule][f"{key}_error"] for rule in order])
+        axes.errorbar(values, rows, xerr=errors, fmt="o", color=BLUE, ecolor=GREY, markersize=4, linewidth=1)
+        few_ticks(axes.xaxis, 5)
+    left.axvline(0, color=ORANGE, linewidth=1)
+    right.axvline(95, color=ORANGE, linewidth=1)
+    left.set_yticks(rows, order)
+    left.set_xlabel("worse than the best rule by (nats an answer)")
+    right.set_xlabel("answers in the central 95 % (%)")
     return figure
 
 
+@styled
 def reliability_figure(content: dict[str, Any], rules: tuple[str, ...] = ("bcm", "hierarchical")) -> Figure:
     """Predicted probabilities of categories against how often they were chosen, for two rules."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(ONE_COLUMN, 3.0), layout="constrained")
-        axes = figure.subplots()
-        axes.plot([0, 1], [0, 1], color=GREY, linewidth=1)
-        for rule, colour, marker in zip(rules, (ORANGE, BLUE), ("s", "o"), strict=True):
-            bins = content["rules"].get(rule, {}).get("reliability", [])
-            axes.plot(
-                [b["predicted"] for b in bins],
-                [b["observed"] for b in bins],
-                color=colour,
-                marker=marker,
-                markersize=4,
-                linewidth=1,
-                label=rule,
-            )
-        axes.set(
-            xlabel="predicted probability of a category", ylabel="how often it was chosen", xlim=(0, 1), ylim=(0, 1)
-        )
-        axes.legend(frameon=False)
+    figure, axes = new_figure(ONE_COLUMN, 3.0)
+    axes.plot([0, 1], [0, 1], color=GREY, linewidth=1)
+    for rule, colour, marker in zip(rules, (ORANGE, BLUE), ("s", "o"), strict=True):
+        bins = content["rules"].get(rule, {}).get("reliability", [])
+        points = [[b[key] for b in bins] for key in ("predicted", "observed")]
+        axes.plot(*points, color=colour, marker=marker, markersize=4, linewidth=1, label=rule)
+    axes.set(xlabel="predicted probability of a category", ylabel="how often it was chosen")
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    axes.legend(frameon=False)
     return figure
 
 
+@styled
 def coverage_figure(
     study: Study, predict: Callable[..., Any], point: Float[np.ndarray, " d"], prior: float, limit: float = 0.8
 ) -> Figure:
@@ -70,26 +70,24 @@ def coverage_figure(
     parameters through `point`; hatched where it is above `limit`: nobody's answers say much there."""
     parameters = study.space.parameters
     side = np.linspace(0.0, 1.0, _CELLS)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(ONE_COLUMN, 2.9), layout="constrained")
-        axes = figure.subplots()
-        if len(parameters) == 1:
-            ratio = np.sqrt(np.asarray(predict(jnp.asarray(side[:, None]))[1]) / prior)
-            along = np.asarray(parameters[0].to_physical(jnp.asarray(side)))
-            axes.plot(along, ratio, color=BLUE)
-            axes.fill_between(along, 0, 1, where=ratio > limit, hatch="///", facecolor="none", edgecolor=GREY)
-            label_axes(axes, study, 0, 0)
-            axes.set(ylabel="sd of the map, over that without answers", yscale="linear", ylim=(0, 1.05))
-        else:
-            grid = np.tile(np.asarray(point), (_CELLS, _CELLS, 1))
-            grid[..., 0], grid[..., 1] = np.meshgrid(side, side, indexing="ij")
-            flat = grid.reshape(-1, len(parameters))
-            ratio = np.sqrt(np.asarray(predict(jnp.asarray(flat))[1]) / prior).reshape(_CELLS, _CELLS)
-            feasible = np.asarray(study.space.feasible(flat)).reshape(_CELLS, _CELLS)
-            ratio = np.where(feasible, ratio, np.nan)
-            sides = [np.asarray(p.to_physical(jnp.asarray(side))) for p in parameters[:2]]
-            shown = axes.pcolormesh(*sides, ratio.T, cmap="cividis", vmin=0, vmax=1, shading="gouraud", rasterized=True)
-            axes.contourf(*sides, ratio.T, levels=[limit, 10.0], hatches=["///"], colors="none")
-            figure.colorbar(shown, ax=axes, label="sd of the map, over that without answers")
-            label_axes(axes, study, 0, 1)
+    figure, axes = new_figure(ONE_COLUMN, 2.9)
+    if len(parameters) == 1:
+        ratio = np.sqrt(np.asarray(predict(jnp.asarray(side[:, None]))[1]) / prior)
+        along = np.asarray(parameters[0].to_physical(jnp.asarray(side)))
+        axes.plot(along, ratio, color=BLUE)
+        axes.fill_between(along, 0, 1, where=ratio > limit, hatch="///", facecolor="none", edgecolor=GREY)
+        label_axes(axes, study, 0, 0)
+        axes.set(ylabel="sd of the map, over that without answers", yscale="linear", ylim=(0, 1.05))
+    else:
+        grid = np.tile(np.asarray(point), (_CELLS, _CELLS, 1))
+        grid[..., 0], grid[..., 1] = np.meshgrid(side, side, indexing="ij")
+        flat = grid.reshape(-1, len(parameters))
+        ratio = np.sqrt(np.asarray(predict(jnp.asarray(flat))[1]) / prior).reshape(_CELLS, _CELLS)
+        feasible = np.asarray(study.space.feasible(flat)).reshape(_CELLS, _CELLS)
+        ratio = np.where(feasible, ratio, np.nan)
+        sides = [np.asarray(p.to_physical(jnp.asarray(side))) for p in parameters[:2]]
+        shown = axes.pcolormesh(*sides, ratio.T, cmap="cividis", vmin=0, vmax=1, shading="gouraud", rasterized=True)
+        axes.contourf(*sides, ratio.T, levels=[limit, 10.0], hatches=["///"], colors="none")
+        figure.colorbar(shown, ax=axes, label="sd of the map, over that without answers")
+        label_axes(axes, study, 0, 1)
     return figure

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
@@ -13,11 +12,12 @@ from hilbo.report.figures.style import (
     GREY,
     ONE_COLUMN,
     RED,
-    STYLE,
     TWO_COLUMNS,
     band,
     few_ticks,
     legend,
+    new_figure,
+    styled,
 )
 from hilbo.search.apart import nrmse
 from hilbo.study.analysis.cohort_results import CohortResults
@@ -28,6 +28,7 @@ from hilbo.study.config import Study
 __all__ = ["individual_convergence", "population_convergence", "progress_figure"]
 
 
+@styled
 def individual_convergence(study: Study, cohort: Cohort, progress: Progress) -> Figure:
     """Left: everybody's running optimum against their final one, and against that of a half of the people without them.
     Right: answers in the highest category so far.
@@ -35,75 +36,70 @@ def individual_convergence(study: Study, cohort: Cohort, progress: Progress) -> 
     Median and quartiles over people. Paper, figure 5.
     """
     trials, (_, errors) = progress.counts, progress.to_end()
-    top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(TWO_COLUMNS, 2.6), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        band(left, trials, 100 * errors.T, BLUE, "to their own final optimum")
-        if progress.splits:
-            others = 100 * np.nanmedian(np.where(np.isnan(errors), np.nan, progress.individual_to_half), axis=1)
-            left.plot(trials, others, color=GREY, linestyle="--", label="to that of half of the others")
-        left.set(xlabel="trials", ylabel="NRMSE of individual optima (%)", ylim=(0, None))
-        left.legend(frameon=False)
-        band(right, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
-        right.set(xlabel="trials", ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
-        right.legend(frameon=False, loc="upper left")
-        few_ticks(right.yaxis, 5, integer=True)
-        for axes in (left, right):
-            few_ticks(axes.xaxis, 6, integer=True)
+    figure, (left, right) = new_figure(TWO_COLUMNS, 2.6, 1, 2)
+    band(left, trials, 100 * errors.T, BLUE, "to their own final optimum")
+    if progress.splits:
+        others = 100 * np.nanmedian(np.where(np.isnan(errors), np.nan, progress.individual_to_half), axis=1)
+        left.plot(trials, others, color=GREY, linestyle="--", label="to that of half of the others")
+    left.set(xlabel="trials", ylabel="NRMSE of individual optima (%)", ylim=(0, None))
+    left.legend(frameon=False)
+    _top_answers(right, study, cohort, trials, "trials")
+    few_ticks(left.xaxis, 6, integer=True)
     return figure
 
 
+def _top_answers(axes, study: Study, cohort: Cohort, trials: np.ndarray, xlabel: str) -> None:
+    """Answers in the highest category so far: median and quartiles over participants."""
+    top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
+    band(axes, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
+    axes.set(xlabel=xlabel, ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
+    axes.legend(frameon=False, loc="upper left")
+    few_ticks(axes.yaxis, 5, integer=True)
+    few_ticks(axes.xaxis, 6, integer=True)
+
+
+@styled
 def population_convergence(progress: Progress, references: Mapping[str, Float[np.ndarray, " d"]]) -> Figure:
     """The population's running optimum against its final one, and against named references (system identification,
     the truth); dashed, that of one half of the people against the other half's. Paper, figure 7b."""
     looks = [(RED, "o", "-"), (BLUE, "s", "--"), (GREEN, "^", "-.")]
     targets = {"its final optimum": progress.population[-1]} | dict(references)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(ONE_COLUMN, 2.7), layout="constrained")
-        axes = figure.subplots()
-        for (name, x), (colour, marker, dashes) in zip(targets.items(), looks, strict=False):
-            miss = 100 * np.asarray(nrmse(progress.population, x, progress.levels))
-            axes.plot(
-                progress.counts, miss, color=colour, marker=marker, linestyle=dashes, markersize=3.5, label=f"to {name}"
-            )
-        if progress.splits:
-            halves = 100 * np.median(progress.halves, axis=1)
-            axes.plot(progress.counts, halves, color=GREY, linestyle="--", label="between halves")
-        axes.set(xlabel="trials of each participant", ylabel="NRMSE of the population optimum (%)", ylim=(0, None))
-        few_ticks(axes.xaxis, 6, integer=True)
-        legend(figure, axes.get_legend_handles_labels()[0])
+    figure, axes = new_figure(ONE_COLUMN, 2.7)
+    for (name, x), (colour, marker, dashes) in zip(targets.items(), looks, strict=False):
+        miss = 100 * np.asarray(nrmse(progress.population, x, progress.levels))
+        look = {"color": colour, "marker": marker, "linestyle": dashes, "markersize": 3.5}
+        axes.plot(progress.counts, miss, label=f"to {name}", **look)
+    if progress.splits:
+        halves = 100 * np.median(progress.halves, axis=1)
+        axes.plot(progress.counts, halves, color=GREY, linestyle="--", label="between halves")
+    axes.set(xlabel="trials of each participant", ylabel="NRMSE of the population optimum (%)", ylim=(0, None))
+    few_ticks(axes.xaxis, 6, integer=True)
+    legend(figure, axes.get_legend_handles_labels()[0])
     return figure
 
 
+@styled
 def progress_figure(study: Study, population: CohortResults, truth: Float[np.ndarray, " d"] | None = None) -> Figure:
     """How the optima settle (left, NRMSE to the last trial's, or to the truth), and answers in the top category."""
-    progress, cohort = population.progress, population.cohort
+    progress = population.progress
     trials = progress.counts
     to_end, individual_errors = progress.to_end()
     from_goal = to_end
     if truth is not None:
         from_goal = np.sqrt(np.mean((progress.population - truth) ** 2, axis=1))
         individual_errors = np.sqrt(np.mean((progress.individual - truth) ** 2, axis=2))
-    top = (np.asarray(cohort.trials.q) == len(study.responses) - 1) & np.asarray(cohort.trials.mask)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(TWO_COLUMNS, 2.7), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        goal = "the final optimum" if truth is None else "the truth"
-        band(left, trials, 100 * individual_errors.T, BLUE, "individuals: median, quartiles")
-        left.plot(trials, 100 * from_goal, color=RED, marker="o", markersize=3, label="population map")
-        if truth is not None:
-            left.plot(trials, 100 * to_end, color=GREY, linestyle="--", label="population map, to its final optimum")
-        elif progress.splits:
-            halves = 100 * np.median(progress.halves, axis=1)
-            left.plot(trials, halves, color=GREY, linestyle="--", label="between halves of the people")
-        left.set(xlabel="trials of each participant", ylabel=f"NRMSE to {goal} (%)")
-        left.set_ylim(0, left.get_ylim()[1] * 1.25)  # room for the legend
-        left.legend(frameon=False, loc="upper right")
-        band(right, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
-        right.set(xlabel="trials of each participant", ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
-        right.legend(frameon=False, loc="upper left")
-        few_ticks(right.yaxis, 5, integer=True)
-        for axes in (left, right):
-            few_ticks(axes.xaxis, 6, integer=True)
+    figure, (left, right) = new_figure(TWO_COLUMNS, 2.7, 1, 2)
+    goal = "the final optimum" if truth is None else "the truth"
+    band(left, trials, 100 * individual_errors.T, BLUE, "individuals: median, quartiles")
+    left.plot(trials, 100 * from_goal, color=RED, marker="o", markersize=3, label="population map")
+    if truth is not None:
+        left.plot(trials, 100 * to_end, color=GREY, linestyle="--", label="population map, to its final optimum")
+    elif progress.splits:
+        halves = 100 * np.median(progress.halves, axis=1)
+        left.plot(trials, halves, color=GREY, linestyle="--", label="between halves of the people")
+    left.set(xlabel="trials of each participant", ylabel=f"NRMSE to {goal} (%)")
+    left.set_ylim(0, left.get_ylim()[1] * 1.25)  # room for the legend
+    left.legend(frameon=False, loc="upper right")
+    _top_answers(right, study, population.cohort, trials, "trials of each participant")
+    few_ticks(left.xaxis, 6, integer=True)
     return figure

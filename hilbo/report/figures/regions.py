@@ -11,13 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from hilbo.report.figures.maps import plane
 from hilbo.report.figures.style import (
     RED,
-    STYLE,
     TWO_COLUMNS,
     label_axes,
     legend,
+    new_figure,
     star,
+    styled,
     title,
 )
 from hilbo.study.analysis.analysis import Reading
@@ -28,6 +30,7 @@ __all__ = ["class_regions"]
 _CELLS = 101  # along a side
 
 
+@styled
 def class_regions(readings: Mapping[str, Reading]) -> Figure:
     """The most probable answer around each reading's optimum, and its tolerance intervals. Paper, figure 8.
 
@@ -39,37 +42,29 @@ def class_regions(readings: Mapping[str, Reading]) -> Figure:
     pairs = [(0, 1), (0, 2)] if d > 2 else [(0, d - 1)]
     shades = ListedColormap(mpl.colormaps["cividis"](np.linspace(0.12, 1.0, len(labels))))
     rows, across = (len(readings), len(pairs)) if len(pairs) > 1 else (1, len(readings))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(TWO_COLUMNS, 2.4 * rows + 0.4), layout="constrained")
-        grid = figure.subplots(rows, across, squeeze=False).reshape(len(readings), len(pairs))
-        for (name, reading), row in zip(readings.items(), grid, strict=True):
-            for axes, (i, j) in zip(row, pairs, strict=True):
-                if d == 1:
-                    _class_curves(axes, reading, shades)
-                else:
-                    _regions(axes, reading, i, j, shades)
-                title(axes, name)
-        handles: list[Any] = [
-            Patch(facecolor=shades(k), edgecolor="black", linewidth=0.5, label=label) for k, label in enumerate(labels)
-        ]
-        handles.append(Line2D([], [], color=RED, linewidth=2, label="tolerance interval"))
-        legend(figure, handles)
+    figure, grid = new_figure(TWO_COLUMNS, 2.4 * rows + 0.4, rows, across, squeeze=False)
+    for (name, reading), row in zip(readings.items(), grid.reshape(len(readings), len(pairs)), strict=True):
+        for axes, (i, j) in zip(row, pairs, strict=True):
+            if d == 1:
+                _class_curves(axes, reading, shades)
+            else:
+                _regions(axes, reading, i, j, shades)
+            title(axes, name)
+    handles: list[Any] = [
+        Patch(facecolor=shades(k), edgecolor="black", linewidth=0.5, label=label) for k, label in enumerate(labels)
+    ]
+    handles.append(Line2D([], [], color=RED, linewidth=2, label="tolerance interval"))
+    legend(figure, handles)
     return figure
 
 
 def _regions(axes, reading, i, j, shades):
     study, best = reading.study, np.asarray(reading.aggregate.optimum.x)
-    across, up = (study.space.parameters[k].axis(_CELLS) for k in (i, j))
-    x = np.tile(best, (len(up), len(across), 1))
-    x[..., i], x[..., j] = np.meshgrid(across, up)
-    flat = jnp.asarray(x.reshape(-1, x.shape[-1]))
-    likeliest = np.argmax(np.asarray(_probabilities(reading, flat)), axis=1).astype(float)
-    values = np.where(np.asarray(study.space.feasible(flat)), likeliest, np.nan).reshape(x.shape[:-1])
+    grid = plane(study, best, (i, j))
+    likeliest = np.argmax(np.asarray(_probabilities(reading, jnp.asarray(grid.points))), axis=1)
     label_axes(axes, study, i, j)
-    sides = ((i, across), (j, up))
-    first, second = (np.asarray(study.space.parameters[k].to_physical(jnp.asarray(side))) for k, side in sides)
-    count = len(study.responses)
-    axes.pcolormesh(first, second, values, cmap=shades, vmin=-0.5, vmax=count - 0.5, shading="nearest", rasterized=True)
+    scale = {"vmin": -0.5, "vmax": len(study.responses) - 0.5}
+    axes.pcolormesh(*grid.sides, grid.image(likeliest), cmap=shades, **scale, shading="nearest", rasterized=True)
     for index in (i, j):
         _interval(axes, reading, index, i, j)
     star(axes, study, best, (i, j))

@@ -16,18 +16,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from hilbo.report.figures.answers import answer_handles, mark_trials
-from hilbo.report.figures.maps import Slice, grid_slice, map_handles, map_panels, maps_beside, sides
+from hilbo.report.figures.maps import Slice, draw_curve, grid_slice, map_handles, map_panels, maps_beside
 from hilbo.report.figures.style import (
-    BLUE,
     GREEN,
     ONE_COLUMN,
     ORANGE,
     RED,
-    STYLE,
-    label_axes,
     legend,
     level_words,
+    new_figure,
     star,
+    styled,
     title,
 )
 from hilbo.search.apart import nrmse
@@ -90,7 +89,7 @@ def sets_on_map(
     hatched, counts = False, []
     for axes, (name, third), values in zip(panels, thirds.items(), grids, strict=True):
         draw(axes, values)
-        hatched |= _hatch(axes, study, values, prior)
+        hatched |= _hatch(axes, values, prior)
         counts.append(mark_trials(axes, study, cohort, third))
         for shown in points if third is None else [name]:
             _mark(axes, study, shown, points[shown])
@@ -106,41 +105,32 @@ def sets_on_map(
     return figure, hatched
 
 
-def _hatch(axes, study: Study, values: Slice, prior: ArrayLike) -> bool:
+def _hatch(axes, values: Slice, prior: ArrayLike) -> bool:
     """Hatch what is feasible and of which the map knows less than `UNKNOWN`; whether there is such a part."""
     unknown = (values.sd > UNKNOWN * np.sqrt(np.asarray(prior))).astype(float)  # NaN is not
     if unknown.any():
         with mpl.rc_context({"hatch.linewidth": 0.5, "hatch.color": "white"}):
-            axes.contourf(*sides(study), unknown, levels=[0.5, 1.5], colors="none", hatches=["////"])
+            axes.contourf(*values.sides, unknown, levels=[0.5, 1.5], colors="none", hatches=["////"])
     return bool(unknown.any())
 
 
 def _mark(axes, study, name, x):
     marker, size, colour = _MARKS[name]
-    point = np.asarray(study.space.to_physical(np.asarray(x)))
-    axes.scatter(
-        *point[:2], marker=marker, s=size, color=colour, edgecolor="black", linewidth=0.7, zorder=5, clip_on=False
-    )
+    look = {"marker": marker, "s": size, "color": colour, "edgecolor": "black", "linewidth": 0.7}
+    axes.scatter(*np.asarray(study.space.to_physical(np.asarray(x)))[:2], zorder=5, clip_on=False, **look)
 
 
+@styled
 def _sets_on_curve(study, surface, points):
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(ONE_COLUMN, 2.6), layout="constrained")
-        axes = figure.subplots()
-        side = jnp.linspace(0.0, 1.0, _CELLS)
-        mean, variance = (np.asarray(moment) for moment in surface(side[:, None]))
-        physical_side, sd = np.asarray(study.space.parameters[0].to_physical(side)), np.sqrt(variance)
-        label_axes(axes, study, 0, 0)
-        axes.fill_between(physical_side, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0)
-        axes.plot(physical_side, mean, color=BLUE)
-        for name, x in points.items():
-            marker, size, colour = _MARKS[name]
-            physical = np.asarray(study.space.to_physical(np.asarray(x)))
-            height = float(surface(jnp.asarray(x)[None, :])[0][0])
-            axes.scatter(
-                physical[0], height, marker=marker, s=size, color=colour, edgecolor="black", label=name, zorder=3
-            )
-        axes.set(yscale="linear", ylabel=f"{study.attribute} f")
-        axes.autoscale(axis="y")
-        axes.legend(frameon=False)
+    figure, axes = new_figure(ONE_COLUMN, 2.6)
+    side = jnp.linspace(0.0, 1.0, _CELLS)
+    mean, variance = (np.asarray(moment) for moment in surface(side[:, None]))
+    draw_curve(axes, study, (np.asarray(study.space.parameters[0].to_physical(side)), mean, np.sqrt(variance)))
+    for name, x in points.items():
+        marker, size, colour = _MARKS[name]
+        physical = np.asarray(study.space.to_physical(np.asarray(x)))
+        height = float(surface(jnp.asarray(x)[None, :])[0][0])
+        look = {"marker": marker, "s": size, "color": colour, "edgecolor": "black"}
+        axes.scatter(physical[0], height, label=name, zorder=3, **look)
+    axes.legend(frameon=False)
     return figure

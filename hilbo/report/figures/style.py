@@ -4,7 +4,11 @@ Maps use cividis and lines the Okabe-Ito colours, which people with colour-blind
 does so by shape too. Widths are those of one and of two columns of a journal.
 """
 
+from typing import Any
+
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from hilbo.study.config import Study
@@ -23,7 +27,9 @@ __all__ = [
     "label_axes",
     "legend",
     "level_words",
+    "new_figure",
     "star",
+    "styled",
     "title",
 ]
 
@@ -41,11 +47,19 @@ STYLE: dict = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
+styled = mpl.rc_context(STYLE)
+"""Decorator of a function that draws: in this style."""
 _WIDEST = 1.1  # inches of an entry of a legend
 
 
+def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **subplots: Any) -> tuple[Figure, Any]:
+    """A figure (inches) and its axes, one or an array, as `Figure.subplots` returns them."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, **subplots)
+
+
 def few_ticks(axis, count: int = 4, *, integer: bool = False) -> None:
-    """So few ticks along a linear axis that their numbers stand apart."""
+    """At most about `count` ticks along a linear axis, so that their numbers do not overlap."""
     axis.set_major_locator(MaxNLocator(count, integer=integer, steps=[1, 2, 2.5, 5, 10]))
 
 
@@ -57,7 +71,7 @@ def legend(figure, handles) -> None:
 
 
 def title(axes, text: str) -> None:
-    """What stands above a panel."""
+    """The title of a panel."""
     axes.set_title(text, fontsize=STYLE["axes.titlesize"])
 
 
@@ -80,7 +94,7 @@ def label_axes(axes, study: Study, i: int, j: int) -> None:
 
 
 def _steps_on(axes, which, parameter) -> None:
-    """An axis of steps: half a step of room at both ends, levels by their names."""
+    """The axis of a discrete parameter: half a step of margin at both ends, levels by their names."""
     getattr(axes, f"set_{which}lim")(parameter.low - 0.5 * (parameter.scale == "linear"), parameter.high + 0.5)
     if parameter.levels:
         getattr(axes, f"set_{which}ticks")(range(len(parameter.levels)), parameter.levels)
@@ -112,7 +126,7 @@ def star(axes, study: Study, x, pair: tuple[int, int] = (0, 1)) -> None:
 
 
 def band(axes, trials, values, colour: str, label: str) -> None:
-    """Median over the first axis of `values` as a line, quartiles as a band; NaN is left out."""
+    """Median over the first axis of `values` as a line, quartiles as a band; NaN are ignored."""
     low, middle, high = np.nanpercentile(values, [25, 50, 75], axis=0)
     axes.fill_between(trials, low, high, color=colour, alpha=0.25, linewidth=0)
     axes.plot(trials, middle, color=colour, label=label)

@@ -4,29 +4,28 @@ As in `maps`, a figure is a function from results to a matplotlib `Figure`, and 
 Shades say the same as the numbers that are written in them.
 """
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import BLUE, GREY, ORANGE, RED, STYLE, TWO_COLUMNS
+from hilbo.report.figures.style import BLUE, GREY, ORANGE, RED, TWO_COLUMNS, new_figure, styled
 
 __all__ = ["aggregate_best_figure", "preference_rows", "validation_figure"]
 
 
+@styled
 def validation_figure(confusion: pd.DataFrame, preferences: pd.DataFrame) -> Figure:
     """Left: how often each set (row) was put in each class (column). Right: how often one of a pair was preferred.
 
     `confusion`: counts, sets by classes; `preferences`: of `preferences.preference_rates`. Paper, figures 6b and 6c.
     """
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(TWO_COLUMNS, 2.9), layout="constrained")
-        left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
-        _matrix(left, confusion)
-        _rates(right, preference_rows(preferences))
+    figure, (left, right) = new_figure(TWO_COLUMNS, 2.9, 1, 2, width_ratios=(1.0, 1.25))
+    _matrix(left, confusion)
+    _rates(right, preference_rows(preferences))
     return figure
 
 
+@styled
 def aggregate_best_figure(people: pd.DataFrame, overall: pd.DataFrame) -> Figure:
     """Share of comparisons in which the aggregate's set was preferred to an individual's, person by person and overall.
 
@@ -34,17 +33,15 @@ def aggregate_best_figure(people: pd.DataFrame, overall: pd.DataFrame) -> Figure
     """
     best = _widest(overall)
     rows = np.arange(len(people))[::-1] + 1
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(5.2, 1.3 + 0.2 * len(people)), layout="constrained")
-        axes = figure.subplots()
-        axes.hlines(rows, people["low"], people["high"], color=BLUE, linewidth=1)
-        axes.scatter(people["rate"], rows, s=22, color=BLUE, zorder=3, label="one participant (exact interval)")
-        axes.hlines([0], best["low"], best["high"], color=RED, linewidth=2)
-        axes.scatter([best["rate"]], [0], s=50, marker="D", color=RED, zorder=3, label=f"all ({best['errors']})")
-        axes.axvline(0.5, color=GREY, linestyle="--", linewidth=1)
-        axes.set_yticks([*rows, 0], [*people["name"], "all"], fontsize=7)
-        axes.set(xlim=(0, 1), ylim=(-0.7, len(people) + 0.7), xlabel="share preferring the aggregate's set")
-        figure.legend(loc="outside upper center", ncols=2, frameon=False)
+    figure, axes = new_figure(5.2, 1.3 + 0.2 * len(people))
+    axes.hlines(rows, people["low"], people["high"], color=BLUE, linewidth=1)
+    axes.scatter(people["rate"], rows, s=22, color=BLUE, zorder=3, label="one participant (exact interval)")
+    axes.hlines([0], best["low"], best["high"], color=RED, linewidth=2)
+    axes.scatter([best["rate"]], [0], s=50, marker="D", color=RED, zorder=3, label=f"all ({best['errors']})")
+    axes.axvline(0.5, color=GREY, linestyle="--", linewidth=1)
+    axes.set_yticks([*rows, 0], [*people["name"], "all"], fontsize=7)
+    axes.set(xlim=(0, 1), ylim=(-0.7, len(people) + 0.7), xlabel="share preferring the aggregate's set")
+    figure.legend(loc="outside upper center", ncols=2, frameon=False)
     return figure
 
 
