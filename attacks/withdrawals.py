@@ -200,8 +200,9 @@ class _Given:
 def _logs(folder: Path) -> None:
     """The trial table's answers as logs of the sessions in which they were given."""
     from hilbo.session.log import actions
-    from hilbo.session.log.event_log import EventLog, log_name
+    from hilbo.session.log.event_log import EventLog
     from hilbo.session.log.header import header_for
+    from hilbo.session.log.log_files import log_name
     from hilbo.study.config import Study
 
     study, table = Study.load("study.toml"), pd.read_csv("trials.csv")
@@ -219,7 +220,7 @@ def _logs(folder: Path) -> None:
 def _judged(folder: Path) -> None:
     """Logs of people who compared the population's set with everybody's own."""
     from hilbo.session.choose.logged_session import LoggedSession
-    from hilbo.session.log.event_log import log_name
+    from hilbo.session.log.log_files import log_name
     from hilbo.session.plan.plan import planned_header
     from hilbo.study.config import Study
 

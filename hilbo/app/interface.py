@@ -104,6 +104,11 @@ class HubInterface(Protocol):
         ...
 
     @property
+    def lost(self) -> bool:
+        """Whether the log's file is lost, which ends the session."""
+        ...
+
+    @property
     def fault(self) -> str | None:
         """What fails in watching for interruptions."""
         ...
@@ -115,6 +120,10 @@ class HubInterface(Protocol):
 
     async def commit(self, make: Callable[[LiveSession, float], Event | None], *, mine: bool = False) -> Any:
         """Make an event from the newest state, write it to the log, and apply it."""
+
+    async def check_log(self) -> None:
+        """Stop the session if its log is lost."""
+        ...
 
     async def map(self) -> dict[str, Any] | None:
         """Slices of the posterior."""

@@ -90,7 +90,7 @@ def session(
             say("loading")
             start()
             from hilbo.app.hub.opening import Wanted, let_go, opened
-            from hilbo.session.log.event_log import keys_path
+            from hilbo.session.log.log_files import keys_path
 
             wanted = Wanted(
                 study, participant, name, seed, served.logs, plan, material, resume, people, warm_start, dry_run

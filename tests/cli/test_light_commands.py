@@ -8,7 +8,8 @@ import pytest
 from live import Driver
 from simulated import ENVIRONMENT, ROOT, needs_device
 
-from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.log.event_log import EventLog
+from hilbo.session.log.log_files import log_name
 from hilbo.session.plan.plan import make_plan
 from hilbo.study.file.reading import StudyFile
 

@@ -12,7 +12,8 @@ import hilbo as hilbo_package
 from hilbo import Study
 from hilbo.cli import doctor, main
 from hilbo.errors import InputError
-from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.log.event_log import EventLog
+from hilbo.session.log.log_files import log_name
 from hilbo.session.log.records import Block
 from hilbo.session.plan.plan import make_plan, planned_header
 from hilbo.study.folder import read_folder

@@ -15,7 +15,8 @@ from live import CHOOSER, RAW, STUDY, Driver, header
 from hilbo import Study
 from hilbo.errors import InputError
 from hilbo.session.log import actions as live
-from hilbo.session.log.event_log import EventLog, LogError, begun, log_name, log_paths, read_log
+from hilbo.session.log.event_log import EventLog, LogError, read_log
+from hilbo.session.log.log_files import begun, log_name, log_paths
 from hilbo.session.log.records import Event
 from hilbo.session.log.state import LiveSession
 

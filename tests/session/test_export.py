@@ -16,7 +16,8 @@ from hilbo.errors import InputError
 from hilbo.session.export.netcdf import netcdf
 from hilbo.session.export.psych_ds import psych_ds
 from hilbo.session.export.tables import read_log_trials, read_sessions, sets_table, trials_table
-from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.log.event_log import EventLog
+from hilbo.session.log.log_files import log_name
 from hilbo.session.plan.participants import add_person, check_consent, read_people
 from hilbo.session.withdrawal.withdrawal import delete_participant
 from hilbo.study.cohort import cohort_of

@@ -19,8 +19,9 @@ from hilbo.session.choose.look_ahead import Answers, LiveChooser, _missing
 from hilbo.session.choose.progress import consistency, trust_of
 from hilbo.session.choose.warm_start import informed, warm_point, warm_start
 from hilbo.session.log import actions as live
-from hilbo.session.log.event_log import EventLog, log_name, read_log
+from hilbo.session.log.event_log import EventLog, read_log
 from hilbo.session.log.header import header_for
+from hilbo.session.log.log_files import log_name
 from hilbo.session.log.records import Block
 from hilbo.session.log.state import LiveSession
 

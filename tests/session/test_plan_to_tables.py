@@ -10,7 +10,8 @@ from hilbo.report.validation import validate, validation_figures
 from hilbo.session.export.psych_ds import psych_ds
 from hilbo.session.export.tables import read_sessions, sets_table
 from hilbo.session.log import actions as live
-from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.log.event_log import EventLog
+from hilbo.session.log.log_files import log_name
 from hilbo.session.log.records import Block, Header, Planned
 from hilbo.session.log.state import LiveSession
 from hilbo.session.plan.plan import make_plan, planned_header

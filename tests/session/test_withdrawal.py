@@ -12,7 +12,8 @@ from live import STUDY, Driver
 
 from hilbo.cli.terminal.console import results
 from hilbo.errors import InputError
-from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.log.event_log import EventLog
+from hilbo.session.log.log_files import log_name
 from hilbo.session.log.records import Block, Header, Planned
 from hilbo.session.plan.participants import read_people
 from hilbo.session.plan.plan import make_plan, plan_hash, planned_header, reissue

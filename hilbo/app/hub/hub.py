@@ -8,6 +8,7 @@ choosing's, and the server's own. What a participant does next is in `runner`, w
 """
 
 import asyncio
+import contextlib
 import time
 from collections import deque
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from hilbo.app.wire.messages import Answer, Command, Press
 from hilbo.app.wire.security import Role
 from hilbo.app.wire.watchers import Watchers
 from hilbo.session.log import actions
-from hilbo.session.log.event_log import LogError
+from hilbo.session.log.event_log import LogError, LogLostError
 from hilbo.session.log.records import RefusedError
 from hilbo.session.log.state import LiveSession
 
@@ -60,6 +61,7 @@ class Hub:
         self._rig: Rig | None = None
         self.begun = False  # whether the participant has said so, since the server started or the page came back
         self.alert: str | None = None
+        self.lost = False  # whether the log's file is lost: the session has ended
         self.without_map = ""  # why, in a sentence
         self.trust: list[list[str]] = []
         self.recent: deque = deque(reversed(log.before[-_RECENT:]), maxlen=_RECENT)
@@ -155,12 +157,7 @@ class Hub:
             if event is None:
                 return None
             before = self.runner.key()
-            try:
-                self.state = await self._loop.run_in_executor(self._disk, self.log.append, event)
-            except LogError as error:
-                self.alert = str(error)
-                self.publish()
-                raise
+            self.state = await self._on_disk(self.log.append, event)
             self.alert = None
             self.recent.appendleft(event)
             if event.kind == "answer":
@@ -169,6 +166,26 @@ class Hub:
             self.runner.restart()
         self.publish()
         return event
+
+    async def check_log(self) -> None:
+        """Stop the session if its log is lost (`EventLog.check`)."""
+        assert self._lock is not None
+        async with self._lock:
+            with contextlib.suppress(LogLostError):
+                await self._on_disk(self.log.check)
+
+    async def _on_disk(self, work: Callable[..., Any], *arguments: Any) -> Any:
+        """The result of work on the log, in the disk's thread. Raises `LogError`, of which the experimenter is told."""
+        try:
+            return await self._loop.run_in_executor(self._disk, work, *arguments)
+        except LogError as error:
+            alert, self.alert = self.alert, str(error)
+            if isinstance(error, LogLostError) and not self.lost:
+                self.lost = True
+                self.runner.restart()
+            if self.alert != alert:
+                self.publish()
+            raise
 
     def hang_up(self) -> None:
         """The server ends: nobody waits for news."""

@@ -121,6 +121,9 @@ class Interruptions:
     async def _look(self) -> None:
         """At the clocks, at what is still to be said, and for the participant's page."""
         hub, now, mono = self.hub, time.time(), time.monotonic()
+        await hub.check_log()
+        if hub.lost:
+            return
         slept = max(abs((now - self._wall) - (mono - self._steady)), mono - self._steady - _LATER)
         self._wall, self._steady = now, mono
         if slept > _JUMP:

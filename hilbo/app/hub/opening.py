@@ -17,8 +17,9 @@ from hilbo.app.rigs.stimulus_rig import StimulusRig
 from hilbo.errors import InputError
 from hilbo.session.choose.look_ahead import LiveChooser, warm_start_sources
 from hilbo.session.choose.warm_start import read_warm_start
-from hilbo.session.log.event_log import EventLog, begun, log_name
+from hilbo.session.log.event_log import EventLog
 from hilbo.session.log.header import header_for, participant_seed
+from hilbo.session.log.log_files import begun, log_name
 from hilbo.session.log.records import Header
 from hilbo.session.log.state import LiveSession
 from hilbo.session.plan.participants import check_consent, read_people

@@ -99,6 +99,11 @@ class Runner:
 
     async def _lead(self) -> None:
         hub = self.hub
+        if hub.lost:
+            await hub.rig.rest()
+            self.trouble = hub.alert or ""
+            self._at("trouble")
+            return
         if hub.state.screen not in ("wait", "trial") or not hub.begun:
             self.clock = {}  # what follows a rest does not follow an answer
             await hub.rig.rest()

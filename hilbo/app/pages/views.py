@@ -240,6 +240,8 @@ def _may(hub):
     actions = ["note", "invite"] + ([] if seen.lost else ["estop"])
     if seen.state in ("HOLD", "ESTOP") and not seen.lost:
         actions.append("clear")
+    if hub.lost:
+        return [action for action in actions if action != "note"]
     if state.screen == "ended":
         return actions
     if state.screen in ("paused", "ready", "rest"):

@@ -16,7 +16,8 @@ import msgspec
 from hilbo.errors import InputError
 from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.log import actions as live
-from hilbo.session.log.event_log import EventLog, begun, log_name
+from hilbo.session.log.event_log import EventLog
+from hilbo.session.log.log_files import begun, log_name
 from hilbo.session.log.records import Header
 from hilbo.session.log.state import LiveSession
 from hilbo.study.config import Study

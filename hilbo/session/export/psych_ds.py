@@ -11,7 +11,7 @@ import pandas as pd
 
 from hilbo.session.export.columns import column_words
 from hilbo.session.export.tables import presentations_table, sessions_table, sets_table, trials_table, validation_table
-from hilbo.session.log.event_log import log_name
+from hilbo.session.log.log_files import log_name
 from hilbo.session.log.state import LiveSession
 from hilbo.study.file.reading import AnyStudy
 from hilbo.study.formats.cell_text import check_text

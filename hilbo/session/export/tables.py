@@ -17,7 +17,8 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.session.export.columns import UNWRITTEN, presented_column
-from hilbo.session.log.event_log import log_paths, read_session
+from hilbo.session.log.event_log import read_session
+from hilbo.session.log.log_files import log_paths
 from hilbo.session.log.presented import in_words
 from hilbo.session.log.records import Trial
 from hilbo.session.log.state import LiveSession

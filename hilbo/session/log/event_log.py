@@ -6,7 +6,6 @@ lock of the operating system on the file, which goes with the process that holds
 """
 
 import os
-import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,18 +13,18 @@ from typing import Any
 
 from hilbo.errors import InputError
 from hilbo.session.log.header_check import check_new_header
-from hilbo.session.log.log_lines import WHY_CUT, event_line, header_line, is_unbegun, read_lines
+from hilbo.session.log.log_lines import event_line, header_line, is_unbegun, read_lines
 from hilbo.session.log.records import Event, Header
 from hilbo.session.log.replay import replayed
+from hilbo.session.log.rescue import fault_of, rescue
 from hilbo.session.log.state import LiveSession
 from hilbo.study.disk.lock import lock
 from hilbo.study.disk.new_file import sync_folder
 from hilbo.study.file.reading import AnyStudy
 from hilbo.study.formats.json_file import read_bytes
 
-__all__ = ["EventLog", "LogError", "begun", "in_use", "keys_path", "log_name", "log_paths", "read_log", "read_session"]
+__all__ = ["EventLog", "LogError", "LogLostError", "read_log", "read_session"]
 
-_SUFFIX = ".session.jsonl"
 _MODE = 0o600
 
 
@@ -33,11 +32,18 @@ class LogError(RuntimeError):
     """An event could not be written; the log is as it was before, and everything acknowledged is in it."""
 
 
+class LogLostError(LogError):
+    """The file at the log's path is no longer the open log; nothing can be acknowledged any more."""
+
+
 class EventLog:
     """An open log: `create` a new one or `resume` one, then `append` events; `state` is always the fold of the file.
 
-    `dropped`: what was wrong with the last line when the log was opened, or "". `sync_s`: the time the last fsync took.
+    `dropped`: fault of the last line when the log was opened, or "". `sync_s`: duration of the last fsync (s).
     `before`: the events that were in it when it was opened.
+
+    A log that was deleted, moved, replaced or edited while it is open raises `LogLostError` from then on; the events
+    that were acknowledged are written to a copy beside it, once.
     """
 
     def __init__(
@@ -45,14 +51,14 @@ class EventLog:
         path: Path,
         file: int,
         state: LiveSession,
-        previous: bytes,
-        size: int,
+        lines: list[bytes],
         dropped: str,
         before: Sequence[Event] = (),
     ) -> None:
         self.path, self.state, self.dropped, self.before = path, state, dropped, before
         self.sync_s = 0.0
-        self._file, self._previous, self._size = file, previous, size
+        self._file, self._lines, self._size = file, lines, sum(map(len, lines))
+        self._torn, self._fault, self._copy = False, "", None
 
     @classmethod
     def create(cls, path: str | os.PathLike, study: AnyStudy, header: Header) -> "EventLog":
@@ -66,13 +72,15 @@ class EventLog:
             file = os.open(path, flags, _MODE)
         except OSError as error:
             raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder.") from error
-        log = cls(path, file, state, b"", 0, "")
+        log = cls(path, file, state, [], "")
         try:
             lock(file, path)
             if not is_unbegun(_content(file)):
                 raise InputError(f"{path}: exists already; resume it, or choose another session.")
             _cut(file, 0)
-            log._write(header_line(header))
+            line = header_line(header)
+            log._write(line)
+            log._lines.append(line)
         except (LogError, InputError):
             log.close()
             raise
@@ -94,34 +102,67 @@ class EventLog:
             content = _content(file)
             header, events, lines, dropped = read_lines(content, path)
             state = _folded(path, study, header, events)
-            size = _ended(file, path, content, sum(map(len, lines)))
+            _end(file, path, content, sum(map(len, lines)))
         except BaseException:
             os.close(file)
             raise
-        return cls(path, file, state, lines[-1], size, dropped, events)
+        return cls(path, file, state, lines, dropped, events)
 
     def append(self, event: Event) -> LiveSession:
         """Put an event on the disk, and only then into the state, which is returned. Raises LogError."""
         state = self.state.after(event)
-        self._write(event_line(event, self._previous))
+        line = event_line(event, self._lines[-1])
+        self.check()
+        self._write(line)
+        self.check()
+        self._lines.append(line)
         self.state = state
         return state
+
+    def check(self) -> None:
+        """Raise LogLostError if the file at the log's path is not, or at any time was not, this log as it was written.
+
+        The first time, the acknowledged events are copied; while that fails, it is tried again at each call.
+        """
+        if not self._torn:
+            self._fault = self._fault or fault_of(self.path, self._file, self._size)
+        if not self._fault:
+            return
+        answers = sum(trial.status == "answered" for trial in self.state.trials)
+        kept = f"The {answers} answers acknowledged so far"
+        try:
+            self._copy = self._copy or rescue(self.path, self._lines)
+        except OSError as error:
+            raise LogLostError(
+                f"{self.path}: {self._fault}. {kept} are at stake: they could not be copied ({error.strerror}); make"
+                " the folder writable, and leave this server running until this message changes."
+            ) from error
+        raise LogLostError(
+            f"{self.path}: {self._fault}, and the session has stopped. {kept} are in {self._copy}: end this server,"
+            f" compare the two, give one of them the name of the log, and go on with --resume."
+        )
 
     def _write(self, line):
         begun = time.perf_counter()
         try:
+            if self._torn:
+                _cut(self._file, self._size)
+                self._torn = False
             os.lseek(self._file, self._size, os.SEEK_SET)
             left = memoryview(line)
             while left:
                 left = left[os.write(self._file, left) :]
             os.fsync(self._file)
         except OSError as error:
-            _cut(self._file, self._size)
+            try:
+                _cut(self._file, self._size)
+            except OSError:  # the next reader drops the torn line; the next event waits until it can be cut off
+                self._torn = True
             raise LogError(
                 f"{self.path}: cannot be written ({error.strerror}); free some space on the disk and try again,"
                 " everything acknowledged so far is safe."
             ) from error
-        self._previous, self._size = line, self._size + len(line)
+        self._size += len(line)
         self.sync_s = time.perf_counter() - begun
 
     def close(self) -> None:
@@ -156,55 +197,11 @@ def read_session(
     return _folded(path, study, header, events)
 
 
-def begun(path: str | os.PathLike) -> bool:
-    """Whether there is a session at this path, or another file: not where a log was killed within its first line."""
-    try:
-        with open(path, "rb") as file:
-            return not is_unbegun(file.readline())
-    except FileNotFoundError:
-        return False
-
-
-def in_use(path: str | os.PathLike) -> bool:
-    """Whether somebody is writing this log."""
-    file = os.open(path, os.O_RDWR)
-    try:
-        lock(file, Path(path))
-    except InputError:
-        return True
-    finally:
-        os.close(file)
-    return False
-
-
-def log_name(header: Header) -> str:
-    """File name of a session's log."""
-    parts = (header.participant, header.session)
-    return "_".join(re.sub(r"[^\w.-]", "-", part) for part in parts) + _SUFFIX
-
-
-def keys_path(log: Path) -> Path:
-    """The file beside a log that keeps the keys of its browsers. It has the log's own name, so that no other session
-    can have it."""
-    return log.with_name(f".{log.name.removesuffix(_SUFFIX)}.keys")
-
-
-def log_paths(folder: str | os.PathLike, note: Callable[[str], Any] = lambda sentence: None) -> list[Path]:
-    """The logs in a folder that were begun, in the order of their names; `note` is told of others."""
-    whole = []
-    for path in sorted(Path(folder).glob("*" + _SUFFIX)):
-        if begun(path):
-            whole.append(path)
-        else:
-            note(f"{path}: has no whole first line, and is left out; {WHY_CUT}")
-    return whole
-
-
-def _ended(file, path, content, size) -> int:
-    """Bring a log to the end of its last good line: what is torn off goes, a newline that is missing comes. The size.
-    Raises InputError."""
+def _end(file, path, content, size):
+    """Bring a log to the end of its last good line: a torn line is cut off, a missing newline is added. Raises
+    InputError."""
     if size == len(content):
-        return size
+        return
     try:
         if size < len(content):
             os.ftruncate(file, size)
@@ -214,7 +211,6 @@ def _ended(file, path, content, size) -> int:
         os.fsync(file)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); free some space and try again.") from error
-    return size
 
 
 def _check_study(path, study, header):
@@ -234,12 +230,9 @@ def _folded(path, study, header, events) -> LiveSession:
 
 
 def _cut(file, size):
-    """Take back what was half written; if even that fails, the next reader drops it as a torn line."""
-    try:
-        os.ftruncate(file, size)
-        os.fsync(file)
-    except OSError:
-        pass
+    """Cut a half-written line off. Raises OSError."""
+    os.ftruncate(file, size)
+    os.fsync(file)
 
 
 def _content(file) -> bytes:

@@ -24,13 +24,14 @@ from hilbo.errors import InputError
 from hilbo.session.log.records import Event, Header
 from hilbo.study.formats.json_file import converted, decoded
 
-__all__ = ["WHY_CUT", "Read", "event_line", "header_line", "is_unbegun", "read_lines"]
+__all__ = ["FIRST", "WHY_CUT", "Read", "event_line", "header_line", "is_unbegun", "read_lines"]
 
 WHY_CUT = (
     "where hilbo was killed while it wrote, nothing acknowledged is missing; where this is a copy, copy the log again."
 )
 _WHAT = "is not what this hilbo writes"
-_FIRST = b'{"seq":0,"kind":"header",'
+FIRST = b'{"seq":0,"kind":"header",'
+"""Beginning of every log."""
 _CRC = re.compile(rb',"crc":"([0-9a-f]{8})"\}\n\Z')
 
 
@@ -67,7 +68,7 @@ def event_line(event: Event, previous: bytes) -> bytes:
 
 def is_unbegun(content: bytes) -> bool:
     """Whether this is the beginning of a log's first line, without its end."""
-    return b"\n" not in content and content[: len(_FIRST)] == _FIRST[: len(content)]
+    return b"\n" not in content and content[: len(FIRST)] == FIRST[: len(content)]
 
 
 def read_lines(content: bytes, path: str | os.PathLike) -> Read:

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from hilbo.errors import InputError
-from hilbo.session.log.event_log import in_use, keys_path, read_log
+from hilbo.session.log.event_log import read_log
+from hilbo.session.log.log_files import in_use, keys_path
 from hilbo.session.withdrawal.files import Below, files_below, is_closed, refusals, remove
 from hilbo.session.withdrawal.names import CODED_JUDGED, CODED_OWN, file_is_called_after, file_names
 from hilbo.session.withdrawal.results import clear_results, plan_without, results_folders

@@ -1,0 +1,49 @@
+"""Detection of a log that was deleted, moved, replaced or edited while it is open, and the copy of what it held.
+
+A log is open by its descriptor, which survives what happens to the path: events would be acknowledged into a file that
+nobody finds. The path is therefore compared with the descriptor around each write. The copy is for a person to look
+at: it has a name that no command reads as a log.
+"""
+
+import contextlib
+import os
+import secrets
+from collections.abc import Sequence
+from pathlib import Path
+
+__all__ = ["RESCUED", "fault_of", "rescue"]
+
+RESCUED = ".rescued.jsonl"
+"""Suffix of copies."""
+
+
+def fault_of(path: Path, file: int, size: int) -> str:
+    """How the file at `path` differs from the open `file` of `size` bytes, as the predicate of a sentence.
+
+    "" if it does not."""
+    try:
+        found = os.stat(path, follow_symlinks=False)
+    except OSError as error:
+        return f"is gone ({error.strerror}): it was deleted, moved or renamed"
+    if not os.path.samestat(found, os.fstat(file)):
+        return "was replaced by another file"
+    if found.st_size != size:
+        return f"was changed by another program ({found.st_size} bytes in place of {size})"
+    return ""
+
+
+def rescue(path: Path, lines: Sequence[bytes]) -> Path:
+    """Write the lines of a log to a new file of mode 0600 beside it, and return its path. Raises OSError."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    copy = path.with_name(f"{path.name.split('.session')[0]}.{secrets.token_hex(4)}{RESCUED}")
+    file = os.open(copy, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o600)
+    try:
+        with os.fdopen(file, "wb") as out:
+            out.write(b"".join(lines))
+            out.flush()
+            os.fsync(out.fileno())
+    except OSError:
+        with contextlib.suppress(OSError):
+            copy.unlink()
+        raise
+    return copy
