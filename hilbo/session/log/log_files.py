@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hilbo.errors import InputError
-from hilbo.session.log.file_lock import lock
+from hilbo.study.disk.lock import lock
 from hilbo.session.log.log_lines import FIRST, WHY_CUT, is_unbegun
 from hilbo.session.log.records import Header
 from hilbo.session.log.rescue import RESCUED
