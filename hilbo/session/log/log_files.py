@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from hilbo.errors import InputError
-from hilbo.study.disk.lock import lock
 from hilbo.session.log.log_lines import FIRST, WHY_CUT, is_unbegun
 from hilbo.session.log.records import Header
 from hilbo.session.log.rescue import RESCUED
+from hilbo.study.disk.lock import lock
 
 __all__ = ["begun", "in_use", "is_log", "keys_path", "log_name", "log_paths"]
 
