@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 from hilbo.app.hub import commands
 from hilbo.app.hub.commands import NotNowError
@@ -34,6 +34,7 @@ __all__ = ["PRESSES", "Hub"]
 _WHY = 200  # characters of an error
 _RECENT = 200  # events that the experimenter's page may show
 PRESSES = ("begin", "break", "more", "here")
+Result = TypeVar("Result")
 
 
 class Hub:
@@ -174,7 +175,7 @@ class Hub:
             with contextlib.suppress(LogLostError):
                 await self._on_disk(self.log.check)
 
-    async def _on_disk(self, work: Callable[..., Any], *arguments: Any) -> Any:
+    async def _on_disk(self, work: Callable[..., Result], *arguments: object) -> Result:
         """The result of work on the log, in the disk's thread. Raises `LogError`, of which the experimenter is told."""
         try:
             return await self._loop.run_in_executor(self._disk, work, *arguments)

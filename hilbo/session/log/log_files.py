@@ -4,7 +4,6 @@ import os
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from hilbo.errors import InputError
 from hilbo.session.log.log_lines import FIRST, WHY_CUT, is_unbegun
@@ -50,7 +49,7 @@ def keys_path(log: Path) -> Path:
     return log.with_name(f".{log.name.removesuffix(SUFFIX)}.keys")
 
 
-def log_paths(folder: str | os.PathLike, note: Callable[[str], Any] = lambda sentence: None) -> list[Path]:
+def log_paths(folder: str | os.PathLike, note: Callable[[str], object] = lambda sentence: None) -> list[Path]:
     """The logs in a folder that were begun, in the order of their names. `note` gets a sentence on each log that is
     left out: without a whole first line, under another name, or a copy of a log that was lost."""
     whole = []

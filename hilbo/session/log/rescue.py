@@ -22,13 +22,13 @@ def fault_of(path: Path, file: int, size: int) -> str:
 
     "" if it does not."""
     try:
-        found = os.stat(path, follow_symlinks=False)
+        at_path = os.stat(path, follow_symlinks=False)
     except OSError as error:
         return f"is gone ({error.strerror}): it was deleted, moved or renamed"
-    if not os.path.samestat(found, os.fstat(file)):
+    if not os.path.samestat(at_path, os.fstat(file)):
         return "was replaced by another file"
-    if found.st_size != size:
-        return f"was changed by another program ({found.st_size} bytes in place of {size})"
+    if at_path.st_size != size:
+        return f"was changed by another program ({at_path.st_size} bytes in place of {size})"
     return ""
 
 
