@@ -33,9 +33,10 @@ from populations import chance_at  # noqa: E402
 from populations_people import POPULATIONS  # noqa: E402
 
 from hilbo.population.learnt.posterior import LEFT  # noqa: E402
-from hilbo.population.learnt.recipes import LEARNT_1, RECIPES  # noqa: E402
 from hilbo.population.learnt.rule import learn  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
+from hilbo.population.rules.recipes import LEARNT_1  # noqa: E402
+from hilbo.population.rules.registry import RECIPES  # noqa: E402
 from hilbo.population.shared.features import pivots_of  # noqa: E402
 from hilbo.population.shared.low_rank import shared_evidence  # noqa: E402
 from hilbo.population.shared.tallies import tallied  # noqa: E402

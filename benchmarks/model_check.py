@@ -19,7 +19,7 @@ from rows import Rows
 
 from hilbo.population.judged.baselines import quadratic
 from hilbo.population.judged.leave_one_out import clustered, leave_one_out_learnt
-from hilbo.population.learnt.recipes import RECOMMENDED
+from hilbo.population.rules.registry import RECOMMENDED
 from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import simulate_study
 from hilbo.study.analysis.model_check import _compared, _differs

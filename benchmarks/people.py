@@ -36,11 +36,12 @@ from people_evidence import learn_people  # noqa: E402
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials  # noqa: E402
 from hilbo.population.judged.baselines import constant, quadratic  # noqa: E402
 from hilbo.population.judged.leave_one_out import clustered, integral_transform  # noqa: E402
-from hilbo.population.learnt.recipes import LEARNT_1, LEARNT_2, RECIPES  # noqa: E402
 from hilbo.population.learnt.rule import learn  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
 from hilbo.population.newcomer import class_probabilities  # noqa: E402
-from hilbo.population.pointwise import RULES, aggregate  # noqa: E402
+from hilbo.population.pointwise import aggregate  # noqa: E402
+from hilbo.population.rules.recipes import LEARNT_1, LEARNT_2  # noqa: E402
+from hilbo.population.rules.registry import POINTWISE, RECIPES  # noqa: E402
 from hilbo.population.shared.counts import Counts, fit_counts  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
@@ -113,7 +114,7 @@ def predicted(gp, share, counts, common, mask, x):
     experts = each(gp, counts)
     means, explained = jax.vmap(lambda p: p.predict_explained(x))(experts)
     maps = {}
-    for rule in RULES:
+    for rule in POINTWISE:
         part = share if rule == "hierarchical" else None
         maps[rule] = aggregate(rule, means, explained, prior, share=part, mask=mask)
     maps["hierarchical"] = maps["hierarchical"][0], maps["hierarchical"][1] + (1 - share) * prior

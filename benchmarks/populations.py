@@ -36,8 +36,8 @@ from rows import Rows  # noqa: E402
 from hilbo import acquisition  # noqa: E402
 from hilbo.ordinal_gp import Trials  # noqa: E402
 from hilbo.population.judged.leave_one_out import clustered  # noqa: E402
-from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.population.maps import learnt_map, rule_map  # noqa: E402
+from hilbo.population.rules.registry import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
 from hilbo.study.analysis.region import optimum_region  # noqa: E402

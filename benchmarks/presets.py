@@ -24,8 +24,8 @@ from preset_search import CROWD, STUDY, distance, individuals, truth_of, validat
 from rows import Rows  # noqa: E402
 
 from hilbo.errors import InputError  # noqa: E402
-from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.population.maps import learnt_map, rule_map  # noqa: E402
+from hilbo.population.rules.registry import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.presets import PRESETS  # noqa: E402
 from hilbo.simulation.simulate import people, simulate_study  # noqa: E402

@@ -20,7 +20,8 @@ from populations import by_chance, by_recipe, cohort_from, highest, rounded, wit
 from populations_people import FEATURES, PAPER, ChanceOfFunctions, Drawn, Scene
 from rows import Rows
 
-from hilbo.population.learnt.recipes import LEARNT_1, RECOMMENDED
+from hilbo.population.rules.recipes import LEARNT_1
+from hilbo.population.rules.registry import RECOMMENDED
 from hilbo.search.candidates import search_points
 from hilbo.study.analysis.region import optimum_region
 

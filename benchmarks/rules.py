@@ -30,12 +30,13 @@ from pages import DOCS, put  # noqa: E402
 
 from hilbo.errors import InputError  # noqa: E402
 from hilbo.ordinal_gp import Trials, fit  # noqa: E402
-from hilbo.population.maps import GIVEN_RULES, rule_map, share_of  # noqa: E402
+from hilbo.population.maps import rule_map, share_of  # noqa: E402
+from hilbo.population.rules.registry import GIVEN  # noqa: E402
 from hilbo.simulation import simulate  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
 
 STUDY = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
-NAMES = ("hierarchical, by points", *GIVEN_RULES)
+NAMES = ("hierarchical, by points", *GIVEN)
 GRID = np.linspace(-3.0, 3.0, 601)
 AROUND = (0.05, 0.02, 0.01)
 

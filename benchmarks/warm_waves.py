@@ -30,8 +30,8 @@ from populations_people import POPULATIONS  # noqa: E402
 from rows import Rows  # noqa: E402
 
 from hilbo.ordinal_gp import Trials, fit  # noqa: E402
-from hilbo.population.learnt.recipes import RECOMMENDED  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
+from hilbo.population.rules.registry import RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.session.choose.warm_start import warm_point, warm_start  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402

@@ -33,7 +33,8 @@ MAY_IMPORT = {
     "ordinal_gp": {"inference", "fitting_input"},
     "hyperparameters": {"ordinal_gp"},
     "population.shared": {"ordinal_gp"},
-    "population.learnt": {"population.shared"},
+    "population.rules": set(),
+    "population.learnt": {"population.rules", "population.shared"},
     "population": {"bcm", "population.learnt"},
     "population.judged": {"population"},
     "mechanics": {"numerics"},
@@ -42,7 +43,7 @@ MAY_IMPORT = {
     "search": {"passivity", "kernels"},
     "study.disk": set(),
     "study.formats": {"search"},
-    "study.file": {"study.formats"},
+    "study.file": {"population.rules", "study.formats"},
     "study.tables": {"study.file"},
     "study": {"population.judged", "study.tables"},
     "study.estimate": {"acquisition", "study"},
@@ -101,7 +102,7 @@ ONLY_IN = {"matplotlib": {"report.figures"}, "serial": {"device.ports"}}
 WITHOUT_JAX = {
     *("errors", "device", "hardware_bridge", "identification.motor", "cli.device"),
     *("app.wire", "app.rigs", "app.server"),
-    *("study.disk", "study.formats", "study.file", "study.tables"),
+    *("population.rules", "study.disk", "study.formats", "study.file", "study.tables"),
     *("session.log", "session.export", "session.plan", "session.withdrawal"),
     *("mechanics.span", "search.box", "report.json_text", "app.pages.pace", "app.pages.session_views"),
 }

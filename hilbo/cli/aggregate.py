@@ -10,6 +10,7 @@ import typer
 
 from hilbo.cli.terminal.console import Force, Json, Out, finish, progress, remark, results, seed_option, start
 from hilbo.errors import InputError
+from hilbo.population.rules.registry import GIVEN, RECIPES, RULES
 from hilbo.report.figures.painter import begin_painter
 
 __all__ = ["aggregate", "aggregate_cohort", "read_cohort", "robustness"]
@@ -17,7 +18,6 @@ __all__ = ["aggregate", "aggregate_cohort", "read_cohort", "robustness"]
 # What draws and writes, loaded beside the arithmetic. Packages that the arithmetic never imports, because two threads
 # that import one package at once may see half of it.
 _DRAW_AND_WRITE = ("matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2")
-_SUMS = ("bcm", "average")  # sums over people, at each point for itself
 _LARGE = 1000  # participants: above, posteriors are not kept, and what costs a fit of everybody is left out
 
 StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
@@ -38,8 +38,8 @@ def aggregate(
     rule: Annotated[
         str | None,
         typer.Option(
-            help="Rule of aggregation in place of the study file's: bcm, hierarchical, average, pooled, or"
-            " learnt-1 and learnt-2, which learn [gp] too."
+            help=f"Rule of aggregation in place of the study file's: {', '.join(GIVEN)}, or"
+            f" {' and '.join(RECIPES)}, which learn [gp] too."
         ),
     ] = None,
     compare: Annotated[
@@ -82,7 +82,7 @@ def aggregate(
         if _at_once(chosen.rule, len(cohort.names), team.devices, individuals, compare):
             content = aggregate_cohort(chosen, cohort, folder, seed, say, compare=compare, left_out=left_out)
         else:
-            if chosen.rule == "hierarchical" and team.writes:
+            if RULES[chosen.rule].learns_share and team.writes:
                 remark("The hierarchical rule is taken person by person at each point here; the exact map may differ.")
             content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say, left_out)
     if team.writes:
@@ -179,7 +179,7 @@ def _at_once(rule: str, people: int, devices: int, individuals: bool, compare: b
     """Whether everybody's posterior is kept, with everybody's own optimum; otherwise people are merged as a stream.
     Raises `InputError` where --compare asks for what a stream does not have."""
     few = devices == 1 and people <= _LARGE
-    if few and not individuals and rule not in _SUMS:
+    if few and not individuals and RULES[rule].joint:
         remark(f'Everybody\'s own optimum is sought, too: the rule "{rule}" takes all answers at once.')
         return True
     if compare and not (few and individuals):
@@ -214,11 +214,10 @@ def aggregate_cohort(
 
 def _aggregate_population(study, cohort, team, folder, seed, individuals, say, left_out=()) -> dict[str, Any]:
     """As `aggregate_cohort` for a large cohort or several devices: by the whole crew, of which one process writes."""
-    from hilbo.population.learnt.recipes import RECIPES
     from hilbo.report.large_population import population_map, write_population
     from hilbo.study.estimate.batch_optimum import aggregate_population
 
-    if study.rule in RECIPES:
+    if RULES[study.rule].learns:
         say("learning the hyperparameters from all answers")
     large = aggregate_population(study, cohort, team, seed, individuals=individuals, say=say)
     grid = population_map(large.study, large)

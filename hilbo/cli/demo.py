@@ -35,7 +35,7 @@ def _print_demo(real: dict[str, Any], simulated: dict[str, Any], out: Path) -> N
     from rich.console import Console
     from rich.table import Table as RichTable
 
-    from hilbo.population.learnt.recipes import RECOMMENDED
+    from hilbo.population.rules.registry import RECOMMENDED
 
     console = Console(highlight=False, soft_wrap=True)
     best = real["optimum"]["parameters"]

@@ -11,8 +11,6 @@ The share that people have in common is learnt by evidence, from an even choice 
 posterior mean is used: the most probable share may be 0 or 1, where nothing, or everything, would be common.
 """
 
-from typing import Literal, get_args
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,18 +26,15 @@ from hilbo.numerics.shown import has_values
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
-from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.learnt.rule import Learnt, learnt_function
 from hilbo.population.newcomer import class_probabilities
+from hilbo.population.rules.registry import GIVEN, RULES
 from hilbo.population.shared.counts import Counts, counts_of, fit_counts, one_person
 from hilbo.population.shared.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
 from hilbo.population.shared.posterior import ContextEffects
 
 __all__ = [
-    "ALL_RULES",
-    "GIVEN_RULES",
     "LARGEST_EXACT",
-    "AnyRule",
     "RuleMap",
     "even_rows",
     "learnt_map",
@@ -47,11 +42,6 @@ __all__ = [
     "rule_map",
     "share_of",
 ]
-
-AnyRule = Literal[pointwise.Rule, "pooled", "learnt-1", "learnt-2"]
-GIVEN_RULES: tuple[AnyRule, ...] = (*get_args(pointwise.Rule), "pooled")
-"""Rules that take the hyperparameters as they are."""
-ALL_RULES: tuple[AnyRule, ...] = (*GIVEN_RULES, *RECIPES)  # type: ignore[assignment]
 
 LARGEST_EXACT = 1500
 """Answers, or latent values, up to which the exact models are used: they are cubic in their number."""
@@ -95,8 +85,8 @@ class RuleMap(eqx.Module):
             assert self.shared is not None
             return self.shared.predict(x)
         means, explained = jax.vmap(lambda person: person.predict_explained(x))(self.experts)
-        share = self.share if self.rule == "hierarchical" else None
-        return pointwise.aggregate(self.rule, means, explained, self.prior, share=share)  # type: ignore[arg-type]
+        share = self.share if RULES[self.rule].learns_share else None
+        return pointwise.aggregate(self.rule, means, explained, self.prior, share=share)
 
     def astype(self, dtype: DTypeLike) -> "RuleMap":
         """The same map that predicts in another precision."""
@@ -112,7 +102,7 @@ class RuleMap(eqx.Module):
     @property
     def map_prior(self) -> Float[Array, ""]:
         """Variance of the map where nobody answered, against which its own tells what the answers say."""
-        if self.rule == "average":
+        if not RULES[self.rule].weighted:
             return self.prior / jax.tree.leaves(self.experts)[0].shape[0]
         return self.share * self.prior
 
@@ -132,14 +122,11 @@ class RuleMap(eqx.Module):
         return class_probabilities(likelihood, *self.newcomer(x), self.widths)
 
 
-def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[pointwise.Rule, Float[Array, ""] | None]:
+def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[str, Float[Array, ""] | None]:
     """By which rule, and with which share, everybody's posteriors are aggregated point by point in place of a map: by
     the same rule, or by bcm where the rule takes all answers at once; a recipe is the hierarchical one."""
-    if rule in RECIPES:
-        return "hierarchical", share
-    if rule not in pointwise.RULES:
-        return "bcm", None
-    return rule, share if rule == "hierarchical" else None  # type: ignore[return-value]
+    by_points = RULES[rule].pointwise
+    return by_points, share if RULES[by_points].learns_share else None
 
 
 def learnt_map(learnt: Learnt, trials: Trials) -> RuleMap:
@@ -148,7 +135,7 @@ def learnt_map(learnt: Learnt, trials: Trials) -> RuleMap:
     _, variances = shared.predict(trials.x.reshape(-1, trials.x.shape[-1]))
     reach = jnp.max(jnp.where(trials.mask.reshape(-1), variances, 0.0))
     model = learnt.model
-    prior, centred = model.shared + model.own, RECIPES[learnt.recipe].centred
+    prior, centred = model.shared + model.own, RULES[learnt.recipe].centred
     return RuleMap(learnt.recipe, "exact", None, shared, model.share, prior, reach, learnt.widths, centred, effects)
 
 
@@ -162,29 +149,29 @@ def rule_map(
     inference: str = "laplace",
     largest: int = LARGEST_EXACT,
 ) -> RuleMap:
-    """The map by a rule of `GIVEN_RULES` from stacked trials (M, n).
+    """The map by a rule of `GIVEN` from stacked trials (M, n).
 
     **Arguments:** `posteriors`: everybody's own, if they are there; `share`: of the hierarchical rule, else learnt by
     `share_of`; `largest`: exact models are used up to so many latent values. Raises InputError for what a rule cannot
     do with these answers.
     """
-    if rule not in GIVEN_RULES:
-        raise InputError(f'rule_map: the rule is "{rule}"; it must be one of {", ".join(GIVEN_RULES)}.')
+    if rule not in GIVEN:
+        raise InputError(f'rule_map: the rule is "{rule}"; it must be one of {", ".join(GIVEN)}.')
     prior = jnp.asarray(gp.kernel.variance)
     one = to_device(1.0, prior.dtype)
-    if rule == "hierarchical":
+    if RULES[rule].learns_share:
         map_share = jnp.asarray(share_of(gp, trials, inference).mean if share is None else share, prior.dtype)
         shared = _shared_function(gp, trials, map_share, inference, largest)
         if shared is not None:
             return RuleMap(rule, "exact", None, shared, map_share, prior)
     else:
         map_share, shared = one, None
-    if rule == "pooled":
+    if RULES[rule].exact_only:
         shared = _pooled(gp, trials, inference, largest)
         if shared is None:
             answers, people = int(np.asarray(trials.mask).sum()), trials.mask.shape[0]
             raise InputError(
-                f'The rule "pooled" fits one model to all answers at once, and {answers:,} of {people:,} people are too'
+                f'The rule "{rule}" fits one model to all answers at once, and {answers:,} of {people:,} people are too'
                 ' many; use "bcm", "hierarchical" or another rule that aggregates people point by point.'
             )
         return RuleMap(rule, "exact", None, shared, one, prior)

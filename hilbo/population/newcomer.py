@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.population.learnt.recipes import WIDTHS
+from hilbo.population.rules.recipes import WIDTHS
 
 __all__ = ["InTurn", "class_probabilities", "in_turn", "log_highest", "predicted_in_turn"]
 

@@ -20,7 +20,7 @@ Reference: Tresp (2000). Products of experts, rbcm and grbcm were better on no p
 """
 
 import functools
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -29,11 +29,9 @@ from jaxtyping import Array, Bool, Float
 from hilbo import bcm
 from hilbo.errors import InputError
 from hilbo.numerics.tracing import traced_once
+from hilbo.population.rules.registry import POINTWISE, RULES
 
-__all__ = ["RULES", "Rule", "Sums", "aggregate", "terms"]
-
-Rule = Literal["bcm", "hierarchical", "average"]
-RULES: tuple[Rule, ...] = get_args(Rule)
+__all__ = ["Sums", "aggregate", "terms"]
 
 
 class Sums(NamedTuple):
@@ -46,10 +44,10 @@ class Sums(NamedTuple):
     means: Any
     explained: Any
 
-    def merge(self, prior: Any, people: Any, rule: Rule = "bcm", share: Any = 1.0) -> tuple[Any, Any]:
+    def merge(self, prior: Any, people: Any, rule: str = "bcm", share: Any = 1.0) -> tuple[Any, Any]:
         """Mean and variance of the map of so many people with the prior variance `prior`, by the rule that the sums
         were made for; all of them serve the average."""
-        if rule == "average":
+        if not RULES[rule].weighted:
             return self.means / people, (prior - self.explained / people) / people
         common = prior * share
         variance = common / (1.0 + common * self.added)
@@ -68,7 +66,7 @@ def terms(
 
 
 def aggregate(
-    rule: Rule,
+    rule: str,
     means: Float[Array, "M m"],
     explained: Float[Array, "M m"],
     prior_variance: ArrayLike,
@@ -76,7 +74,7 @@ def aggregate(
     share: ArrayLike | None = None,
     mask: Bool[Array, " M"] | None = None,
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Mean and variance (m,) of the population map, by one of `RULES`.
+    """Mean and variance (m,) of the population map, by one of `POINTWISE`.
 
     **Arguments:**
 
@@ -87,9 +85,9 @@ def aggregate(
 
     Raises InputError for a rule that there is not, and for a share that does not belong to it.
     """
-    if rule not in RULES:
-        raise InputError(f'aggregate: the rule is "{rule}"; it must be one of {", ".join(RULES)}.')
-    if (share is None) == (rule == "hierarchical"):
+    if rule not in POINTWISE:
+        raise InputError(f'aggregate: the rule is "{rule}"; it must be one of {", ".join(POINTWISE)}.')
+    if (share is None) == RULES[rule].learns_share:
         raise InputError(
             f'aggregate: a share belongs to the rule "hierarchical" and to no other; the rule is "{rule}".'
         )
@@ -100,7 +98,7 @@ def aggregate(
 
 @functools.partial(traced_once, static_argnames="rule")  # one program, not one for each operation
 def _aggregated(
-    rule: Rule,
+    rule: str,
     means: Float[Array, "M m"],
     explained: Float[Array, "M m"],
     prior_variance: Float[Array, "..."],
@@ -109,7 +107,7 @@ def _aggregated(
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Of `aggregate`, with arguments that were checked."""
     prior = jnp.broadcast_to(prior_variance, means.shape[1:])
-    if rule == "average":
+    if not RULES[rule].weighted:
         return bcm.average(means, prior[None, :] - explained, mask=mask)
     common_share = jnp.ones((), means.dtype) if share is None else share
     each = terms(means, explained, prior[None, :], common_share)

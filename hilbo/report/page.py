@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.rules.registry import RULES
 from hilbo.report.kernel_words import covariance_words, formula
 from hilbo.report.participants import People
 from hilbo.study.config import Study
@@ -19,16 +19,10 @@ Pictures = dict[str, dict[str, str]]
 """Figures by name, each with `png` (base64) and `width` (pixels), of `results.save_figures`."""
 
 _ESTIMATES = {
-    "average": "plain average of the latent functions",
-    "bcm": "committee machine (bcm)",
     "ep": "population map, expectation propagation",
-    "hierarchical": "people who differ (hierarchical)",
     "laplace": "population map, Laplace",
-    "learnt-1": "people who differ, hyperparameters learnt (learnt-1)",
-    "learnt-2": "people who differ, hyperparameters learnt (learnt-2)",
     "mean_of_optima": "mean of the individual optima",
-    "pooled": "one model of all answers",
-}
+} | {rule.name: rule.label for rule in RULES.values()}
 _SHOWN = 200  # participants in the page's table
 
 
@@ -68,7 +62,7 @@ def results_page(
         selection=selection,
         comparison=comparison,
         halves=halves,
-        centred=study.rule in RECIPES and RECIPES[study.rule].centred,
+        rule=RULES[content["rule"]],
     )
 
 

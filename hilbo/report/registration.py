@@ -7,10 +7,11 @@ there as a line to fill in, so that nobody takes its silence for a decision.
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from hilbo.population.rules.registry import RULES
 from hilbo.study.file.protocols import Phase, protocol
 from hilbo.study.file.reading import StudyFile
 
-__all__ = ["registration", "selection_words", "sought"]
+__all__ = ["registration", "selection_words"]
 
 _OPEN = "**To be written by you.**"
 _ACQUISITIONS = {
@@ -19,12 +20,6 @@ _ACQUISITIONS = {
     "thompson": "Thompson sampling",
     "top_category": "probability of the highest answer",
     "mean": "largest posterior mean",
-}
-_RULES = {
-    "bcm": "the Bayesian committee machine",
-    "hierarchical": "the hierarchical model, with a learnt share that people have in common",
-    "average": "the plain average of people's latent functions",
-    "pooled": "one function fitted to all answers",
 }
 
 
@@ -115,20 +110,6 @@ def selection_words(selection: Any) -> str:
     )
 
 
-_HIGHEST = "the maximum of the population map"
-_SOUGHT = {
-    "learnt-1": "the one to which a new person most probably gives the highest answer",
-    "learnt-2": "the place that the best one is most often near, of those to which a new person gives the highest"
-    " answer at most 0.05 less often than to any",
-}
-"""What a rule takes for the optimum, where that is not the map's maximum."""
-
-
-def sought(rule: str) -> str:
-    """What a rule takes for the optimum, among what may be presented."""
-    return _SOUGHT.get(rule, _HIGHEST)
-
-
 def _exclusion(study: StudyFile) -> list[str]:
     rule, flags = study.tables.study.exclude, ", ".join(study.exclude_flags).replace("_", " ")
     trials = f"Trials with these device flags are excluded: {flags} (`[study] exclude_flags`)."
@@ -140,14 +121,13 @@ def _exclusion(study: StudyFile) -> list[str]:
 
 
 def _analysis(study: StudyFile) -> list[str]:
-    rule = study.tables.aggregation.rule
-    words = _RULES.get(rule, f"the hierarchical model with hyperparameters learnt from all answers, recipe {rule}")
+    rule = RULES[study.tables.aggregation.rule]
     effect = study.random_effect
     return [
-        f"* Population map: {words} (`{rule}`), by hilbo's documentation of that version.",
+        f"* Population map: {rule.description} (`{rule.name}`), by hilbo's documentation of that version.",
         *([f"* Random effect of each `{effect}`, where a rule learns the hyperparameters."] if effect else []),
         f"* Model of one person: Gaussian process with an ordinal probit likelihood, {_model(study)}.",
-        f"* Primary result: among the stimuli that may be presented {sought(rule)}, with its predicted"
+        f"* Primary result: among the stimuli that may be presented {rule.sought}, with its predicted"
         " responses of a new participant.",
         "* Beside it: everybody's own maximum, alternative rules, sensitivity to the hyperparameters, predictive"
         " checks with each participant left out. They are secondary, and no rule is chosen by them.",

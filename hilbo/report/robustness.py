@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from hilbo.hyperparameters.judged_evidence import judged_sentences
+from hilbo.population.rules.registry import RECOMMENDED
 from hilbo.report.page import Pictures, rendered
 from hilbo.report.results import as_json, optimum_content, save_figures, versions
 from hilbo.study.analysis.robustness import LIMIT, Robustness
@@ -49,6 +50,7 @@ def robustness_page(study: Study, content: dict[str, Any], figures: Pictures) ->
         warnings=content["warnings"],
         figures=figures,
         limit=LIMIT,
+        recommended=RECOMMENDED,
         sensitivity=sensitivity,
         table=_table(content["learned"]) if content["learned"]["shared"] else None,
     )

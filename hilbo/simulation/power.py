@@ -30,8 +30,8 @@ from scipy.stats import binomtest
 
 from hilbo.errors import InputError
 from hilbo.numerics.tracing import program
-from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map
+from hilbo.population.rules.registry import RULES
 from hilbo.search.apart import differences
 from hilbo.search.candidates import search_points
 from hilbo.simulation.presets import with_truth
@@ -96,15 +96,15 @@ def simulate_power(
 
 def _check_rule(rule: str, plan: Plan) -> None:
     """Raises InputError for numbers of people or of answers that the rule cannot aggregate."""
-    if rule == "hierarchical" and min(plan.participants) < 2:
+    if min(plan.participants) < RULES[rule].least_people:
         raise InputError(
-            'power: the rule "hierarchical" learns how people differ and needs two of them; ask for 2 participants or'
+            f'power: the rule "{rule}" learns how people differ and needs two of them; ask for 2 participants or'
             " more, or use another rule."
         )
     answers = max(plan.participants) * max(plan.trials)
-    if rule == "pooled" and answers > LARGEST_EXACT:
+    if RULES[rule].exact_only and answers > LARGEST_EXACT:
         raise InputError(
-            f'power: the rule "pooled" fits one model to all answers, at most {LARGEST_EXACT:,}, and'
+            f'power: the rule "{rule}" fits one model to all answers, at most {LARGEST_EXACT:,}, and'
             f" {max(plan.participants)} participants with {max(plan.trials)} trials give {answers:,}; ask for fewer, or"
             " use another rule."
         )
@@ -155,7 +155,7 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
     rows = {}
     for count in _turned(plan.trials, index):
         so_far = cohort.first(count)
-        posteriors = None if study.rule in RECIPES else fit_cohort(staged, so_far)
+        posteriors = None if RULES[study.rule].learns else fit_cohort(staged, so_far)
         for m in _turned(plan.participants, index):
             some, given = jax.tree.map(lambda leaf, m=m: leaf[:m], (posteriors, so_far.trials))
             judged = resolved(study, so_far.rows(np.arange(m)))

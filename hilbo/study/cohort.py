@@ -17,7 +17,7 @@ from hilbo.numerics.rows import rows_of
 from hilbo.numerics.shown import has_values
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
-from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.rules.registry import RULES
 from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
 from hilbo.study.tables.trials import checked_trials, is_checked
@@ -155,7 +155,7 @@ def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:
     """Each row's level of the study's random effect; None where the study names none or all are of one level. Raises
     InputError where a rule that learns misses the column, and where there are too many levels to be some."""
     column = study.random_effect
-    if column is None or (column not in table and study.rule not in RECIPES):
+    if column is None or (column not in table and not RULES[study.rule].learns):
         return None
     if column not in table:
         raise InputError(

@@ -10,9 +10,8 @@ from hilbo.errors import InputError
 from hilbo.kernels import Levels
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
 from hilbo.population.learnt.posterior import NOTHING, Stated, every_theta, prior_model
-from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.learnt.rule import Learnt
-from hilbo.population.maps import AnyRule
+from hilbo.population.rules.registry import RULES
 from hilbo.search.space import SearchSpace
 from hilbo.study.file.protocols import SessionTable
 from hilbo.study.file.reading import StudyFile, checked, hash_of, made_of_material, materials_in, read_study
@@ -42,7 +41,7 @@ class Study(eqx.Module):
     """Flags of the device for which an analysis leaves a trial out (`hilbo.study.file.trial_flags`)."""
     selection: Selection = eqx.field(static=True)
     inference: Inference = eqx.field(static=True)
-    rule: AnyRule = eqx.field(static=True)
+    rule: str = eqx.field(static=True)
     random_effect: str | None = eqx.field(static=True)
     """The column of the answers' table whose levels have an effect of their own, by a rule that learns it."""
     source: str = eqx.field(static=True)
@@ -136,7 +135,7 @@ def _gp(file: StudyFile) -> tuple[OrdinalGP, Stated]:
     levels = tuple(Levels(p.steps, p.correlation) if p.levels else None for p in parameters)
     levels = levels if numbers < len(parameters) else ()
     theta, variance, thresholds, noise = table.theta, table.variance, table.thresholds, table.noise
-    if file.tables.aggregation.rule in RECIPES:
+    if RULES[file.tables.aggregation.rule].learns:
         lengths = theta if theta is None or isinstance(theta, tuple) else (theta,) * numbers
         stated = Stated(lengths, variance, thresholds, noise, levels)
         return prior_model(len(parameters), len(file.responses), stated), stated

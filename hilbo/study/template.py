@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from hilbo.errors import InputError
+from hilbo.population.rules.registry import DEFAULT, RECOMMENDED
 from hilbo.search.box import Constraint, Parameter
 from hilbo.study.file.constraint_words import constraint_of
 from hilbo.study.file.reading import StudyFile, checked
@@ -230,11 +231,14 @@ def _rule(new: NewStudy) -> list[str]:
     """The recommended rule; the paper's stands beside it, because it wants numbers that nobody knows before answers."""
     return [
         _line("[aggregation]", "everybody's answers -> one population map"),
-        _line('rule = "learnt-2"', "recommended; its model is learnt from the answers (docs/methods/which_method.md)"),
+        _line(
+            f'rule = "{RECOMMENDED}"',
+            "recommended; its model is learnt from the answers (docs/methods/which_method.md)",
+        ),
         "",
         "# To use the paper's rule, replace the two lines above by these, whose numbers you state before any answer.",
         "# [aggregation]",
-        '# rule = "bcm"',
+        f'# rule = "{DEFAULT}"',
         "# [gp]",
         _line(f"# length = {0.13 if new.device else 0.22}", "over what part of a range answers change"),
         "# variance = 1.0",

@@ -9,10 +9,10 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
 from hilbo.kernels import Matern32
-from hilbo.population.learnt.posterior import NOTHING, Stated, medians, model_at, prior_model
-from hilbo.population.learnt.recipes import LEARNT_1, LEARNT_2
+from hilbo.population.learnt.posterior import KERNELS, NOTHING, Stated, medians, model_at, prior_model
 from hilbo.population.learnt.rule import drawn_functions, learn, learnt_function
 from hilbo.population.learnt.search import first_search, searched
+from hilbo.population.rules.recipes import LEARNT_1, LEARNT_2
 from hilbo.population.shared.hierarchical import fit_people, of_people, shared_posterior
 from hilbo.population.shared.tallies import tallied
 
@@ -73,10 +73,10 @@ def test_the_end_of_learnt_1_is_a_maximum_of_the_dense_posterior():
 def test_the_end_does_not_depend_on_the_start_and_has_the_features_of_its_own_lengths(learnt):
     """From functions that are so smooth that 8 features are all they need."""
     data = tallied(answers(), 3)
-    start = medians(data, NOTHING, LEARNT_2.priors, LEARNT_2.kernel)
+    start = medians(data, NOTHING, LEARNT_2.priors, KERNELS[LEARNT_2.kernel])
     begun, problem = first_search(start | {"theta": start["theta"] - 7.0}, data, NOTHING, LEARNT_2)
     end, its_problem = searched(begun, problem, frozenset(start) - {"widths"})
-    theta = model_at(end.coordinates, data, NOTHING, LEARNT_2.kernel).theta
+    theta = model_at(end.coordinates, data, NOTHING, KERNELS[LEARNT_2.kernel]).theta
     assert np.all(np.abs(np.log(theta / its_problem.theta)) < 0.35)
     assert its_problem.pivots.used.sum() > problem.pivots.used.sum()
     for name, value in learnt.coordinates.items():

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hilbo import Trials
-from hilbo.population.learnt.recipes import LEARNT_2
 from hilbo.population.learnt.rule import learn, learnt_function
 from hilbo.population.learnt.sample import learn_from_sample
+from hilbo.population.rules.recipes import LEARNT_2
 
 PEOPLE, ANSWERS = 12, 20
 

@@ -7,8 +7,8 @@ import pytest
 from hilbo.kernels import RBF
 from hilbo.population.learnt import search
 from hilbo.population.learnt.posterior import NOTHING, Cost
-from hilbo.population.learnt.recipes import LEARNT_1
 from hilbo.population.learnt.search import first_search, searched
+from hilbo.population.rules.recipes import LEARNT_1
 from hilbo.population.shared.features import pivots_for, unexplained
 from hilbo.population.shared.tallies import Tallies
 

@@ -8,7 +8,8 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.errors import InputError
 from hilbo.population.maps import even_rows, rule_map, share_of
-from hilbo.population.pointwise import RULES, aggregate
+from hilbo.population.pointwise import aggregate
+from hilbo.population.rules.registry import POINTWISE
 from hilbo.population.shared.hierarchical import fit_people, of_people, predict_shared
 
 GP = OrdinalGP(RBF(4.0, 1.3), OrdinalProbit((-0.5, 0.5), 0.5))
@@ -21,7 +22,7 @@ def cohort(people=3, answers=6, seed=0):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
 
-@pytest.mark.parametrize("rule", [rule for rule in RULES if rule != "hierarchical"])
+@pytest.mark.parametrize("rule", [rule for rule in POINTWISE if rule != "hierarchical"])
 def test_rules_by_points_are_the_sums_over_people(rule):
     trials = cohort()
     map_ = rule_map(GP, trials, rule)

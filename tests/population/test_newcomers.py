@@ -18,7 +18,7 @@ from hilbo import Trials
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.population import newcomer
 from hilbo.population.maps import RuleMap, point_rule
-from hilbo.population.pointwise import RULES
+from hilbo.population.rules.registry import POINTWISE
 from hilbo.report.figures import regions
 from hilbo.report.figures import study as plotting_study
 from hilbo.report.figures.maps import Slice
@@ -59,7 +59,7 @@ def chances(mean, variance):
     return np.diff(below, prepend=0.0, append=1.0)
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", POINTWISE)
 def test_a_map_without_answers_has_its_prior(posteriors, rule):
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(5, 2)))
     map_ = of_rule(rule, posteriors[False])

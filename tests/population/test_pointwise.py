@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from hilbo import bcm
 from hilbo.errors import InputError
-from hilbo.population.pointwise import RULES, aggregate
+from hilbo.population.pointwise import aggregate
+from hilbo.population.rules.registry import POINTWISE
 
 PRIOR = 1.3
 
@@ -38,7 +39,7 @@ def textbook(rule, means, explained, share):
         return sum(c / a for c, a in zip(m, v, strict=True)) / precision, 1 / precision
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", POINTWISE)
 @pytest.mark.parametrize("count", [1, 5, 60])
 def test_every_rule_is_the_papers(rule, count):
     means, explained = people(count, 4, seed=count)
@@ -89,7 +90,7 @@ def test_people_without_answers_change_nothing(rule):
         np.testing.assert_allclose(a, b, rtol=1e-15)
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", POINTWISE)
 def test_absent_people_may_hold_anything(rule):
     means, explained = map(jnp.asarray, people(6, 5))
     share = 0.5 if rule == "hierarchical" else None

@@ -8,7 +8,8 @@ import pytest
 from jax import numpy as jnp
 
 from hilbo.kernels import RBF, Matern32
-from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.learnt.posterior import KERNELS
+from hilbo.population.rules.registry import RECIPES
 from hilbo.report.kernel_words import covariance_words, formula
 
 X, Y = np.array([0.1, 0.7]), np.array([0.4, 0.5])
@@ -37,7 +38,7 @@ def test_the_formula_is_the_kernel(kind, theta):
 
 def test_every_kernel_of_a_rule_has_words():
     assert covariance_words(RBF(1.0)) == "squared-exponential"
-    assert {name: covariance_words(recipe.kernel(1.0)) for name, recipe in RECIPES.items()} == {
+    assert {name: covariance_words(KERNELS[recipe.kernel](1.0)) for name, recipe in RECIPES.items()} == {
         "learnt-1": "squared-exponential",
         "learnt-2": "Matérn 3/2",
     }

@@ -16,7 +16,8 @@ from commands import run
 from studies import paper_counts, plain
 
 from hilbo import Study, Trials
-from hilbo.population.maps import ALL_RULES, RuleMap
+from hilbo.population.maps import RuleMap
+from hilbo.population.rules.registry import RULES
 from hilbo.report.figures.people import people_figure
 from hilbo.report.figures.progress import individual_convergence
 from hilbo.report.study.comparison import comparison_section
@@ -360,7 +361,7 @@ def test_no_column_of_what_is_not_there():
 def test_every_estimate_of_the_optimum_has_words():
     labels = [
         "population",
-        *(f"population, {name}" for name in ("ep", "laplace", *ALL_RULES, "optimised hyperparameters")),
+        *(f"population, {name}" for name in ("ep", "laplace", *RULES, "optimised hyperparameters")),
     ]
     rows = _alternatives(plain(), pd.DataFrame({"optimum": labels, "u": 0.5}))["rows"]
     words = [row[0] for row in rows]

@@ -7,7 +7,7 @@ import pytest
 from commands import run
 
 from hilbo.errors import InputError
-from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.rules.registry import RECIPES, RULES
 from hilbo.report.registration import registration
 from hilbo.session.plan.plan import make_plan, reissue
 from hilbo.study.departures import Held, departures
@@ -83,7 +83,7 @@ def test_the_primary_result_is_the_optimum_of_the_study_s_rule(page, rule):
     text = page(TEXT.replace('rule = "bcm"', f'rule = "{rule}"'))
     (primary,) = (line for line in text.splitlines() if line.startswith("* Primary result"))
     assert ("maximum of the population map" in primary) == (rule == "bcm")
-    centred = rule != "bcm" and RECIPES[rule].centred
+    centred = RULES[rule].centred
     assert (
         f"most often near, of those to which a new person gives the highest answer at most {_LOSS}" in primary
     ) == centred

@@ -16,8 +16,8 @@ from studies import SOUND
 from hilbo import Session
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials
-from hilbo.population.learnt.recipes import RECOMMENDED
 from hilbo.population.maps import learnt_map
+from hilbo.population.rules.registry import RECOMMENDED
 from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import to_table
 from hilbo.study.analysis.robustness import robustness

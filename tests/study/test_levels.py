@@ -15,7 +15,7 @@ from surfaces import SURFACES, TEXTURES, surfaces
 from hilbo import Session
 from hilbo.errors import InputError
 from hilbo.kernels import RBF, Matern32, embedded, gram, theta_of
-from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.rules.registry import RECIPES
 from hilbo.search.apart import differences, middle_of, nrmse
 from hilbo.search.rendering import set_of
 from hilbo.simulation.presets import population_of

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 
 from hilbo import Study
 from hilbo.errors import InputError
-from hilbo.population.learnt.recipes import RECOMMENDED
+from hilbo.population.rules.registry import RECOMMENDED
 from hilbo.search.box import Constraint, Parameter
 from hilbo.study.file.constraint_words import constraint_of
 from hilbo.study.file.reading import StudyFile

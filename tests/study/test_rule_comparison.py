@@ -9,8 +9,7 @@ import pytest
 from studies import answered, plain_study
 
 from hilbo.population.judged.leave_one_out import LeftOut, calibration
-from hilbo.population.learnt.recipes import RECOMMENDED
-from hilbo.population.maps import GIVEN_RULES
+from hilbo.population.rules.registry import GIVEN, RECOMMENDED
 from hilbo.population.shared.hierarchical import Share
 from hilbo.report.study.comparison import write_comparison
 from hilbo.study.analysis.rule_comparison import recommendation
@@ -22,7 +21,7 @@ def test_everything_is_compared_and_written(tmp_path):
     study = dataclasses.replace(plain_study(2), rule="average")
     content = write_comparison(study, aggregate_cohort(study, answered(study, people=4)), tmp_path).content
     assert json.loads((tmp_path / "comparison.json").read_text()) == content
-    assert set(content["rules"]) == {*GIVEN_RULES, RECOMMENDED}
+    assert set(content["rules"]) == {*GIVEN, RECOMMENDED}
     assert content["rules"][RECOMMENDED]["hyperparameters"] == "learnt in each fold"
     for scores in content["rules"].values():
         assert scores["negative_log_density"] > 0 and 0 <= scores["central_95"] <= 1 and 0 <= scores["covered"] <= 1

@@ -1,16 +1,12 @@
 """The file alone says of a study what the study itself says, and refuses the same mistakes in the same words."""
 
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
 from hilbo.errors import InputError
-from hilbo.population.learnt.recipes import RECIPES
-from hilbo.population.maps import ALL_RULES
 from hilbo.study.config import Study
 from hilbo.study.file.reading import AnyStudy, StudyFile
-from hilbo.study.file.schema import Rule
 
 DATA = Path("hilbo/data")
 GEL = "[materials.gel.renderer]\nK_eff = 0.2\n[materials.gel.parameters.K1]\nhigh = 16.0\n"
@@ -87,7 +83,3 @@ def test_what_has_to_be_computed_is_the_studys_to_refuse(path):
     assert StudyFile.load(path).space.mechanics.damping == 0.001
     with pytest.raises(InputError, match=r"study.toml:\d+: renderer.damping is 0.001 N.s/m, with which no K1"):
         Study.load(path)
-
-
-def test_the_rules_are_those_of_the_population():
-    assert get_args(Rule) == ALL_RULES and set(RECIPES) < set(ALL_RULES)

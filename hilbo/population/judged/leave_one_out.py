@@ -31,10 +31,10 @@ from hilbo.numerics.rows import rows_of
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.learnt.posterior import Stated
-from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.learnt.rule import Learnt, learn
 from hilbo.population.maps import RuleMap, learnt_map, rule_map
 from hilbo.population.newcomer import InTurn, predicted_in_turn
+from hilbo.population.rules.registry import RECIPES
 
 __all__ = [
     "LeftOut",

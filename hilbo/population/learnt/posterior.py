@@ -10,16 +10,17 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from hilbo.kernels import RBF, Levels, Stationary, theta_of
+from hilbo.kernels import RBF, Levels, Matern32, Stationary, theta_of
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP
-from hilbo.population.learnt.recipes import LEARNT_1, Prior
+from hilbo.population.rules.recipes import LEARNT_1, Prior
 from hilbo.population.shared.features import Pivots
 from hilbo.population.shared.low_rank import shared_evidence
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.tallies import Tallies
 
 __all__ = [
+    "KERNELS",
     "LEFT",
     "NOTHING",
     "Coordinates",
@@ -34,6 +35,8 @@ __all__ = [
 ]
 
 Coordinates = dict[str, Float[Array, "..."]]
+KERNELS: dict[str, type[Stationary]] = {"rbf": RBF, "matern32": Matern32}
+"""By their names in recipes."""
 LEFT = 1e-4
 """Of the shared function's prior variance, what the search may leave: 2e-4 of the log evidence of 600 answers."""
 

@@ -1,4 +1,4 @@
-"""The hierarchical model with hyperparameters learnt from all answers, by a recipe of `recipes`.
+"""The hierarchical model with hyperparameters learnt from all answers, by a recipe of `rules.recipes`.
 
 What maximises the Laplace evidence of all answers times the recipe's priors is taken, by L-BFGS from the priors'
 medians, at first with the same widths for all; then with people's own, which are kept if they add 3 or more to the log
@@ -22,6 +22,7 @@ from hilbo.errors import InputError
 from hilbo.numerics.shown import shown
 from hilbo.ordinal_gp import Posterior, Trials
 from hilbo.population.learnt.posterior import (
+    KERNELS,
     NOTHING,
     Coordinates,
     Problem,
@@ -30,8 +31,8 @@ from hilbo.population.learnt.posterior import (
     medians,
     model_at,
 )
-from hilbo.population.learnt.recipes import LEARNT_1, Recipe
 from hilbo.population.learnt.search import LARGEST, Search, first_search, searched
+from hilbo.population.rules.recipes import LEARNT_1, Recipe
 from hilbo.population.shared.features import pivots_for, unexplained
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.posterior import SharedFunction, shared_function
@@ -146,7 +147,7 @@ def learn(
     if not np.asarray(trials.mask).any():
         raise InputError(f"{recipe.name}: nobody gave an answer; at least one person's answers are needed.")
     answers = tallied(trials, categories, 0 if near is None else near.weights.shape[1])
-    start = medians(answers, stated, recipe.priors, recipe.kernel)
+    start = medians(answers, stated, recipe.priors, KERNELS[recipe.kernel])
     common = frozenset(start) - {"widths"}
     if near is not None:
         start |= {name: near.coordinates[name] for name in common}
@@ -155,7 +156,7 @@ def learn(
         return learn(trials, categories, stated, recipe)
     search, problem, free, gain = _with_widths_if_worth(*searched(begun, problem, common), frozenset(start))
     sd, covariance = _spread(search, problem, free)
-    model = model_at(search.coordinates, answers, stated, recipe.kernel)
+    model = model_at(search.coordinates, answers, stated, KERNELS[recipe.kernel])
     left = unexplained(model.unit, answers, problem.pivots)
     return Learnt(
         recipe=recipe.name,

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hilbo.ordinal_gp import Trials
-from hilbo.population.learnt.posterior import LEFT, NOTHING, Problem, Stated, cost_at
-from hilbo.population.learnt.recipes import LEARNT_1, Recipe
+from hilbo.population.learnt.posterior import KERNELS, LEFT, NOTHING, Problem, Stated, cost_at
 from hilbo.population.learnt.rule import Learnt, learn
 from hilbo.population.learnt.search import LARGEST, Search, searched
+from hilbo.population.rules.recipes import LEARNT_1, Recipe
 from hilbo.population.shared.features import pivots_for
 from hilbo.population.shared.tallies import tallied
 
@@ -74,7 +74,7 @@ def _widths(learnt: Learnt, trials: Trials, categories: int, stated: Stated, rec
     answers = tallied(trials, categories)
     start = learnt.coordinates | {"widths": jnp.zeros(len(trials.mask))}
     pivots = pivots_for(learnt.model.unit, answers, LEFT, most=LARGEST)
-    problem = Problem(answers, stated, recipe.priors, recipe.kernel, pivots, learnt.model.theta)
+    problem = Problem(answers, stated, recipe.priors, KERNELS[recipe.kernel], pivots, learnt.model.theta)
     begun = Search(start, cost_at(start, answers.blank, problem), 0, True)
     search, problem = searched(begun, problem, frozenset({"widths"}))
     moved = search.coordinates | {"widths": search.coordinates["widths"] + _FINE}

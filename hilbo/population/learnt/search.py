@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hilbo.population.learnt.posterior import LEFT, Coordinates, Cost, Problem, Stated, cost_at, model_at
-from hilbo.population.learnt.recipes import Recipe
+from hilbo.population.learnt.posterior import KERNELS, LEFT, Coordinates, Cost, Problem, Stated, cost_at, model_at
+from hilbo.population.rules.recipes import Recipe
 from hilbo.population.shared.features import pivots_for
 from hilbo.population.shared.tallies import Tallies
 
@@ -38,9 +38,9 @@ class Search(NamedTuple):
 
 def first_search(start: Coordinates, answers: Tallies, stated: Stated, recipe: Recipe) -> tuple[Search, Problem]:
     """A search that has not moved yet, and its problem."""
-    model = model_at(start, answers, stated, recipe.kernel)
+    model = model_at(start, answers, stated, KERNELS[recipe.kernel])
     pivots = pivots_for(model.unit, answers, LEFT, most=LARGEST)
-    problem = Problem(answers, stated, recipe.priors, recipe.kernel, pivots, model.theta)
+    problem = Problem(answers, stated, recipe.priors, KERNELS[recipe.kernel], pivots, model.theta)
     return Search(start, cost_at(start, answers.blank, problem), 0, True), problem
 
 

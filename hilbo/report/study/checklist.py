@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hilbo.population.rules.registry import RULES
 from hilbo.report.kernel_words import covariance_words, formula
 from hilbo.report.page import number, percent
-from hilbo.report.registration import sought
 from hilbo.study.analysis.analysis import Analysis
 
 __all__ = ["Item", "checklist"]
@@ -93,7 +93,7 @@ def _posterior(analysis, content):
     best = content["optimum"]
     where = ", ".join(f"{name} {number(value)}" for name, value in best["parameters"].items())
     return (
-        f"The optimum is, among what may be presented, {sought(analysis.study.rule)}: {where}; latent score"
+        f"The optimum is, among what may be presented, {RULES[analysis.study.rule].sought}: {where}; latent score"
         f" {best['mean']:.2f} ± {best['sd']:.2f} (standard deviation); tolerance intervals with bootstrap resamples of"
         " the people above."
     )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.rules.registry import RULES
 from hilbo.report import validation
 from hilbo.report.page import Pictures, estimate_words, heads, number, percent, rendered
 from hilbo.report.participants import people_of
@@ -126,7 +126,7 @@ def _compared(analysis: Analysis, seed, say) -> dict[str, Any] | None:
     if np.sum(analysis.cohort.counts() > 0) < _FEWEST:
         return None
     say("comparing the rules of aggregation")
-    return compare(analysis.study, analysis.aggregate, seed, learns=analysis.study.rule in RECIPES)
+    return compare(analysis.study, analysis.aggregate, seed, learns=RULES[analysis.study.rule].learns)
 
 
 def _write_material(material, analysis: Analysis, validated, compared, folder: Path, seed):

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.rules.registry import RULES
 from hilbo.study.analysis.analysis import Analysis
 from hilbo.study.analysis.effects import effects_of
 from hilbo.study.folder import Material
@@ -28,7 +28,7 @@ def study_figures(
     chosen, cohort, aggregate, progress = analysis.study, analysis.cohort, analysis.aggregate, analysis.progress
     best, prior = np.asarray(aggregate.optimum.x), aggregate.map.map_prior
     references = {} if material.reference is None else {material.reference_name: material.reference}
-    own = f"learnt by {chosen.rule}" if chosen.rule in RECIPES else "fixed hyperparameters"
+    own = f"learnt by {chosen.rule}" if RULES[chosen.rule].learns else "fixed hyperparameters"
     regions = {own: analysis.fixed, "optimised hyperparameters": analysis.optimised}
     map_, hatched = study.sets_on_map(chosen, aggregate.surface, analysis.sets, best, cohort, prior)
     figures = {

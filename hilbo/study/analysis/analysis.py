@@ -17,8 +17,8 @@ import pandas as pd
 from hilbo.errors import InputError
 from hilbo.hyperparameters.judged_evidence import Judged, judged_sentences, maximise_judged
 from hilbo.hyperparameters.maximum_evidence import MaximumEvidence
-from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED
 from hilbo.population.maps import RuleMap, learnt_map, point_rule
+from hilbo.population.rules.registry import DEFAULT, RECOMMENDED, RULES
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.analysis.cohort_results import CohortResults, Say, analyse_cohort
@@ -144,7 +144,7 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
 def _with_learnt(population: CohortResults, seed: int, say: Say) -> CohortResults:
     """With the optimum by the recommended recipe among the alternatives, where the study's rule learns nothing."""
     study, aggregate = population.study, population.aggregate
-    if study.rule in RECIPES:
+    if RULES[study.rule].learns:
         return population
     say(f"the same by {RECOMMENDED}")
     learns = resolved(that_learns(study), aggregate.cohort)
@@ -163,10 +163,16 @@ def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Judged, Study, 
     """The hyperparameters of maximum evidence, the study with them, and its aggregate."""
     judged = maximise_judged(study.gp, cohort.trials, _LEARN, inference=study.inference)
     maximum = judged.maximum
-    answered = int((cohort.counts() > 0).sum())
-    rule = study.rule if study.rule not in RECIPES else "hierarchical" if answered > 1 else "bcm"
-    optimised_study = dataclasses.replace(study, gp=maximum.gp, rule=rule, learnt=None)
+    optimised_study = dataclasses.replace(study, gp=maximum.gp, rule=_given_rule(study.rule, cohort), learnt=None)
     return judged, optimised_study, aggregate_cohort(optimised_study, cohort, seed, alternatives=False)
+
+
+def _given_rule(name: str, cohort: Cohort) -> str:
+    """The rule itself, or of one that learns the hyperparameters what stands for it where they are given."""
+    if not RULES[name].learns:
+        return name
+    by_points = RULES[RULES[name].pointwise]
+    return by_points.name if np.sum(cohort.counts() > 0) >= by_points.least_people else DEFAULT
 
 
 def _reading(study: Study, aggregate: Any, seed: int) -> Reading:

@@ -4,8 +4,6 @@ The map of each resample is aggregated from the same posteriors, and its maximum
 fitted again.
 """
 
-from typing import cast
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
-from hilbo.population.pointwise import Rule, aggregate
+from hilbo.population.pointwise import aggregate
 
 __all__ = ["can_resample", "resampled_tops"]
 
@@ -35,12 +33,12 @@ def resampled_tops(
 ) -> Int[np.ndarray, " draws"]:
     """For each resample of the people, the row of `points` (unit cube) where their map is highest.
 
-    **Arguments:** `rule`: one of `pointwise.RULES`; `share`: of the hierarchical rule, else None; `prior`: variance of
+    **Arguments:** `rule`: one of `POINTWISE`; `share`: of the hierarchical rule, else None; `prior`: variance of
     the map where nobody answered.
     """
     people = posteriors.trials.mask.shape[0]
     rows = np.random.default_rng(seed).integers(0, people, (draws, people))
-    return np.asarray(_tops(posteriors, points, jnp.asarray(rows), cast(Rule, rule), share, jnp.asarray(prior)))
+    return np.asarray(_tops(posteriors, points, jnp.asarray(rows), rule, share, jnp.asarray(prior)))
 
 
 @program
@@ -48,7 +46,7 @@ def _tops(
     posteriors: Posterior,
     points: Float[Array, "m d"],
     rows: Int[Array, "draws M"],
-    rule: Rule,
+    rule: str,
     share: ArrayLike | None,
     prior: Float[Array, ""],
 ) -> Int[Array, " draws"]:

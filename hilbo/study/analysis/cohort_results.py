@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
-from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.rules.registry import RULES
 from hilbo.study.analysis.progress import Progress, follow
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
@@ -50,7 +50,7 @@ def analyse_cohort(
 ) -> CohortResults:
     """The aggregate of a cohort, and its optima after fewer trials, which a thread goes on to compute; everything is
     fitted once. `tell` is given the optimum in sentences as soon as it is known."""
-    if study.rule in RECIPES:
+    if RULES[study.rule].learns:
         say("learning the hyperparameters from all answers")
     study = resolved(study, cohort)
     say(f"fitting {len(cohort.names)} participants ({study.name})")

@@ -6,16 +6,14 @@ from typing import Any
 import numpy as np
 
 from hilbo.numerics.host import to_device
-from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED
 from hilbo.population.maps import RuleMap
-from hilbo.population.pointwise import RULES
+from hilbo.population.rules.registry import RECOMMENDED, RULES
 from hilbo.population.shared.hierarchical import Share
 from hilbo.study.config import Study
 from hilbo.study.estimate.optimum import predict_map
 
-__all__ = ["ALIKE", "SURE", "heterogeneity", "in_place", "rule_warnings", "share_content"]
+__all__ = ["SURE", "heterogeneity", "in_place", "rule_warnings", "share_content"]
 
-ALIKE = ("bcm", "pooled")  # rules that take people to share one function
 SURE = 3.0  # log Bayes factor, about 20 to 1
 _TOO_SURE = 1.5  # times as large as the map says: a standard deviation worth a sentence
 
@@ -38,17 +36,18 @@ def share_content(share: Share) -> dict[str, Any]:
 
 def in_place(map_: RuleMap) -> str:
     """How maps of fewer trials, and of bootstrap resamples, are aggregated where that differs; else nothing."""
-    if map_.rule in RECIPES:
-        return "by the rule hierarchical point by point, with the learnt hyperparameters"
-    if map_.rule not in RULES:
-        return "by bcm"
-    return "" if map_.method == "by points" else f"by the rule {map_.rule} point by point"
+    rule = RULES[map_.rule]
+    if map_.method == "by points":
+        return ""
+    if rule.exact_only:
+        return f"by {rule.pointwise}"
+    return f"by the rule {rule.pointwise} point by point" + (", with the learnt hyperparameters" * rule.learns)
 
 
 def rule_warnings(study: Study, aggregate: Any) -> list[str]:
     """A sentence where the study's rule takes people to be alike and the answers say that they are not."""
     share = aggregate.share
-    if share is None or study.rule not in ALIKE or float(share.against_one) < SURE:
+    if share is None or not RULES[study.rule].homogeneous or float(share.against_one) < SURE:
         return []
     low, high = np.asarray(share.interval).tolist()
     words = (

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from hilbo.population.judged.baselines import constant, quadratic
 from hilbo.population.judged.leave_one_out import LeftOut, clustered, leave_one_out, leave_one_out_learnt
-from hilbo.population.learnt.recipes import RECIPES
+from hilbo.population.rules.registry import RULES
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate
 
@@ -94,12 +94,12 @@ def _percent(share: float) -> str:
 def _left_out(study: Study, aggregate: Aggregate, answered: np.ndarray) -> LeftOut:
     """Alone, or in groups of people from all over the table where they would be too many folds."""
     trials = aggregate.cohort.trials
-    cheap = study.rule in RECIPES or aggregate.map.method == "by points"
+    cheap = RULES[study.rule].learns or aggregate.map.method == "by points"
     folds = min(_FOLDS if cheap else _DEAR_FOLDS, len(answered))
     groups = [answered[k::folds] for k in range(folds)]
     if study.learnt is not None:
         return leave_one_out_learnt(study.learnt, trials, study.stated, again=False, groups=groups)[0]
-    share = aggregate.map.share if study.rule == "hierarchical" else None
+    share = aggregate.map.share if RULES[study.rule].learns_share else None
     return leave_one_out(
         study.gp,
         trials,

@@ -10,7 +10,7 @@ nobody: how far is the optimum of one half, after fewer trials, from that of the
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,8 @@ from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.maps import RuleMap, point_rule
-from hilbo.population.pointwise import Rule, aggregate
+from hilbo.population.pointwise import aggregate
+from hilbo.population.rules.registry import RULES
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.config import Study
@@ -139,10 +140,10 @@ def _highest(map_: RuleMap, points: Float[Array, "m d"], sides: Bool[Array, "k M
     """For each choice of people, the row of the point where their map is highest."""
     means, explained = jax.lax.map(lambda person: person.predict_explained(points), map_.experts)
 
-    share = map_.share if map_.rule == "hierarchical" else None
+    share = map_.share if RULES[map_.rule].learns_share else None
 
     def one(chosen: Bool[Array, " M"]) -> Int[Array, ""]:
-        mean, _ = aggregate(cast(Rule, map_.rule), means, explained, map_.prior, share=share, mask=chosen)
+        mean, _ = aggregate(map_.rule, means, explained, map_.prior, share=share, mask=chosen)
         return jnp.argmax(mean)
 
     return jax.lax.map(one, sides)

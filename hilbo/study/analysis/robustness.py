@@ -21,9 +21,8 @@ from hilbo.hyperparameters.judged_evidence import Judged, maximise_judged
 from hilbo.hyperparameters.maximum_evidence import MaximumEvidence, optimum_sensitivity
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
-from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.maps import point_rule, share_of
-from hilbo.population.pointwise import Rule
+from hilbo.population.rules.registry import RULES
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.analysis.bootstrap import can_resample, resampled_tops
@@ -62,7 +61,7 @@ class Robustness(eqx.Module):
     sensitivity: dict[str, Float[Array, "..."]]
     """d(population optimum, unit cube) / d(log theta, log noise, first threshold, log gaps) at the fixed values."""
     shared: bool = eqx.field(static=True)
-    rule: Rule = eqx.field(static=True)
+    rule: str = eqx.field(static=True)
     """By which people were aggregated, point by point: the study's, or bcm where that takes all answers at once."""
     shares: tuple[Float[Array, ""] | None, Float[Array, ""] | None]
     """Of the hierarchical rule, under the fixed and under the learnt hyperparameters."""
@@ -142,7 +141,7 @@ def _check(study: Study, learn: Sequence[str]) -> None:
         raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
     if unknown := [name for name in learn if name not in _LEARNABLE]:
         raise InputError(f'robustness: asked to learn "{unknown[0]}"; choose from {", ".join(_LEARNABLE)}.')
-    if study.rule in RECIPES:
+    if RULES[study.rule].learns:
         raise InputError(
             f'robustness: compares fixed hyperparameters with learnt ones, and the rule "{study.rule}" has no fixed'
             " ones; its result.json has their intervals."
@@ -163,7 +162,7 @@ def _resampled(
     posteriors: Posterior,
     candidates: Float[Array, "m d"],
     x: Float[Array, " d"],
-    rule: Rule,
+    rule: str,
     share: Float[Array, ""] | None,
     seed: int,
 ) -> Float[Array, " draws"] | None:
@@ -178,7 +177,7 @@ def _resampled(
 
 def _share(study: Study, cohort: Cohort) -> Float[Array, ""] | None:
     """What people have in common, where the study's rule asks for it."""
-    return share_of(study.gp, cohort.trials, study.inference).mean if study.rule == "hierarchical" else None
+    return share_of(study.gp, cohort.trials, study.inference).mean if RULES[study.rule].learns_share else None
 
 
 @program
@@ -187,7 +186,7 @@ def _sensitivity(
     trials: Trials,
     x: Float[Array, " d"],
     learn: tuple[str, ...],
-    rule: Rule,
+    rule: str,
     share: Float[Array, ""] | None,
 ) -> dict[str, Float[Array, "..."]]:
     """Derivatives of the population optimum x, as `Robustness.sensitivity`."""

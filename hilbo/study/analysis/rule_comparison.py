@@ -29,14 +29,13 @@ from hilbo.population.judged.leave_one_out import (
     leave_one_out_learnt,
     reliability,
 )
-from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED
-from hilbo.population.maps import GIVEN_RULES, RuleMap, learnt_map, rule_map, share_of
-from hilbo.population.pointwise import RULES
+from hilbo.population.maps import RuleMap, learnt_map, rule_map, share_of
+from hilbo.population.rules.registry import GIVEN, RECOMMENDED, RULES
 from hilbo.population.shared.hierarchical import Share
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.analysis.bootstrap import resampled_tops
-from hilbo.study.analysis.heterogeneity import ALIKE, SURE, share_content
+from hilbo.study.analysis.heterogeneity import SURE, share_content
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate
@@ -69,7 +68,7 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
     posteriors = jax.tree.map(lambda leaf: leaf[answered], aggregate.posteriors)
     share = aggregate.share or share_of(study.gp, cohort.trials, study.inference)
     fitted = aggregate.maps if everybody else {}
-    maps = {rule: fitted.get(rule) or _map(study, cohort, rule, posteriors, share) for rule in GIVEN_RULES}
+    maps = {rule: fitted.get(rule) or _map(study, cohort, rule, posteriors, share) for rule in GIVEN}
     ground = _ground(study, cohort, posteriors, maps["pooled"], seed)
     rules: dict[str, Any] = {}
     left: dict[str, LeftOut] = {}
@@ -82,7 +81,7 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
         )
         rules[rule] = _entry(study, ground, map_, left[rule], folds)
         rules[rule]["hyperparameters"] = "given" if study.learnt is None else "learnt from all answers"
-    recipe = study.rule if study.rule in RECIPES else RECOMMENDED
+    recipe = study.rule if RULES[study.rule].learns else RECOMMENDED
     if learns:
         left[recipe], rules[recipe] = _learnt_entry(_that_learns(study, recipe, cohort, everybody), ground)
     for rule, (difference, error) in differences(left).items():
@@ -177,7 +176,7 @@ def _by_draws(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[fl
     x = ground.x
     if map_.method == "exact" and map_.shared is not None:
         joint = posterior_map(map_.shared, x)
-    elif map_.rule == "bcm":
+    elif RULES[map_.rule].product:
         joint = joint_map(ground.posteriors, x)
     else:
         return None
@@ -186,9 +185,9 @@ def _by_draws(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[fl
 
 def _by_bootstrap(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[float]] | None:
     """Quantiles of where the map of people drawn with replacement is largest; None for rules that take all at once."""
-    if map_.rule not in RULES:
+    if not RULES[map_.rule].by_points:
         return None
-    share = map_.share if map_.rule == "hierarchical" else None
+    share = map_.share if RULES[map_.rule].learns_share else None
     x = ground.x
     tops = resampled_tops(ground.posteriors, x, map_.rule, share, map_.prior, ground.seed, _DRAWS // 4)
     return _quantiles(study, x, np.bincount(tops, minlength=x.shape[0]) / len(tops))
@@ -236,7 +235,7 @@ def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Sh
         f" answer; {100 * scored[best]['central_95']:.1f} % of the answers lie in its central 95 %)."
     )
     tied = [rule for rule, gap in differences(left).items() if rule != best and _near(*gap)]
-    if best in ALIKE and differ > SURE:
+    if RULES[best].homogeneous and differ > SURE:
         words += f" No rule is recommended: {best} takes people to be alike, so that its intervals are too narrow."
     elif tied:
         words += f" No rule is recommended: {', '.join(tied)} predict{'s' * (len(tied) == 1)} as well, within two"

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
-from hilbo.population.pointwise import Rule, aggregate
+from hilbo.population.pointwise import aggregate
 from hilbo.study.analysis.bootstrap import can_resample
 from hilbo.study.analysis.tolerance import slice_through
 from hilbo.study.config import Study
@@ -45,7 +45,7 @@ def tolerance_ends(
     parameter: str,
     seed: int = 0,
     *,
-    rule: Rule = "bcm",
+    rule: str = "bcm",
     share: ArrayLike | None = None,
     draws: int = _DRAWS,
 ) -> Ends | None:
@@ -93,7 +93,7 @@ def _dominant_in_draws(
     explained: Float[Array, "M m"],
     prior: Float[Array, " m"],
     rows: Int[Array, "draws M"],
-    rule: Rule,
+    rule: str,
     share: ArrayLike | None,
 ) -> Bool[Array, "draws m"]:
     """Whether the highest answer is the likeliest one, (draws, m)."""

@@ -23,9 +23,9 @@ from hilbo.numerics.host import to_device
 from hilbo.numerics.shown import has_values
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
-from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map, share_of
 from hilbo.population.newcomer import class_probabilities
+from hilbo.population.rules.registry import GIVEN, RULES
 from hilbo.population.shared.hierarchical import Share
 from hilbo.search.apart import middle_of
 from hilbo.search.candidates import search_points
@@ -161,11 +161,11 @@ def aggregate_cohort(
     study = resolved(study, cohort)
     candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)
-    share = share_of(study.gp, cohort.trials, study.inference) if study.rule == "hierarchical" else None
+    share = share_of(study.gp, cohort.trials, study.inference) if RULES[study.rule].learns_share else None
     map_ = _rule_map(study, cohort, study.rule, posteriors, share)
     optimum = map_optimum(study, map_, candidates)
     first(optimum, map_)
-    beside = alternatives and study.rule not in RECIPES
+    beside = alternatives and not RULES[study.rule].learns
     with ThreadPoolExecutor(1) as other_core:  # for what does not wait for the share
         individuals = other_core.submit(individual_optima, study, posteriors, candidates)
         by_other = other_core.submit(_by_other_inference, study, cohort, candidates, share) if beside else None
@@ -199,9 +199,11 @@ def _by_other_inference(
 
 
 def _rules(study: Study, cohort: Cohort, share: Share | None) -> list[str]:
-    """The study's rule, and those whose optima stand beside its own, as far as these answers allow them."""
+    """The study's rule, and those whose optima stand beside its own, as far as these answers allow them; first the one
+    that learns the share."""
     few = cohort.counts().sum() <= _LARGEST_POOL
-    beside = [*(["hierarchical"] if share is not None else []), "bcm", "average", *(["pooled"] if few else [])]
+    given = sorted((RULES[name] for name in GIVEN), key=lambda rule: not rule.learns_share)
+    beside = [r.name for r in given if (few or not r.exact_only) and (share is not None or not r.learns_share)]
     return list(dict.fromkeys([study.rule, *beside]))
 
 
@@ -209,7 +211,7 @@ def _rule_map(
     study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: Share | None, inference: str | None = None
 ) -> RuleMap:
     """The map by a rule from everybody's posteriors, or from all answers where the rule takes them at once."""
-    if rule in RECIPES:
+    if RULES[rule].learns:
         assert study.learnt is not None
         return learnt_map(study.learnt, cohort.trials)
     return rule_map(
@@ -219,7 +221,7 @@ def _rule_map(
         posteriors=posteriors,
         share=None if share is None else share.mean,
         inference=study.inference if inference is None else inference,
-        largest=_LARGEST_POOL if rule == "pooled" else LARGEST_EXACT,
+        largest=_LARGEST_POOL if RULES[rule].exact_only else LARGEST_EXACT,
     )
 
 

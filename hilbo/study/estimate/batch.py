@@ -26,7 +26,7 @@ from hilbo.gaussian import factor, mean_and_explained
 from hilbo.kernels import Stationary, gram
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior, Trials, fit
-from hilbo.population.pointwise import Rule, Sums, terms
+from hilbo.population.pointwise import Sums, terms
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Inference, Study
 from hilbo.study.estimate.distributed import AXIS, Crew
@@ -67,7 +67,7 @@ class StreamedCohort(eqx.Module):
     """Blocks that a device makes in one round."""
     inference: Inference = eqx.field(static=True)
     say: SayCount = eqx.field(static=True)
-    rule: Rule = eqx.field(static=True, default="bcm")
+    rule: str = eqx.field(static=True, default="bcm")
     share: float = eqx.field(static=True, default=1.0)
     """Of the hierarchical rule; 1 otherwise."""
 
@@ -182,7 +182,7 @@ def _blocks_on_devices(
     task: _Task,
     inference: Inference,
     crew: Crew,
-    by: tuple[Rule, float],
+    by: tuple[str, float],
 ) -> tuple[Any, Any]:
     """A group of blocks on each device, one after the other; everything comes back to everybody."""
 
@@ -209,7 +209,7 @@ def _one_block(
     task: _Task,
     inference: Inference,
     platform: str,
-    by: tuple[Rule, float] = ("bcm", 1.0),
+    by: tuple[str, float] = ("bcm", 1.0),
 ) -> tuple[Any, dict[str, Any]]:
     """Sums over the people of one block at the points, and what is kept of each of them."""
     if task in ("sums", "jets"):
@@ -278,7 +278,7 @@ def _sum_of_block(of_person: Callable, people: PyTree, platform: str) -> PyTree:
     return jax.lax.scan(lambda total, group: (jax.tree.map(jnp.add, total, of_group(group)), None), zero, groups)[0]
 
 
-def _person_sums(predictor: _Predictor, points: Float[Array, "m d"], by: tuple[Rule, float]) -> Sums:
+def _person_sums(predictor: _Predictor, points: Float[Array, "m d"], by: tuple[str, float]) -> Sums:
     """What one person adds to the sums of a rule at the points."""
     _, share = by
     cross = gram(predictor.kernel, predictor.x, points)
@@ -286,7 +286,7 @@ def _person_sums(predictor: _Predictor, points: Float[Array, "m d"], by: tuple[R
     return terms(means, explained, jax.vmap(predictor.kernel.diagonal)(points), share)
 
 
-def _person_jets(predictor: _Predictor, points: Float[Array, "s d"], by: tuple[Rule, float]) -> Jets:
+def _person_jets(predictor: _Predictor, points: Float[Array, "s d"], by: tuple[str, float]) -> Jets:
     """The same with gradient and Hessian at each point."""
 
     def sums_at(x):

@@ -22,9 +22,9 @@ from jaxtyping import Array, Bool, Float, PyTree
 from hilbo.errors import InputError
 from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
-from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.maps import RuleMap, learnt_map, share_of
-from hilbo.population.pointwise import RULES, Rule, Sums
+from hilbo.population.pointwise import Sums
+from hilbo.population.rules.registry import POINTWISE, RULES
 from hilbo.population.shared.hierarchical import Share
 from hilbo.search.apart import middle_of
 from hilbo.search.candidates import search_points
@@ -103,16 +103,16 @@ def aggregate_population(
     linear in people, in each process by itself.
     """
     candidates = np.asarray(search_points(study.space, seed))
-    if study.rule in RECIPES:
+    if RULES[study.rule].learns:
         return _that_learns(resolved(study, cohort), cohort, crew, candidates, individuals, alternatives, say)
     rule = _streamed(study.rule, len(cohort.names))
-    share = share_of(study.gp, cohort.trials, study.inference) if rule == "hierarchical" else None
+    share = share_of(study.gp, cohort.trials, study.inference) if RULES[rule].learns_share else None
     population = streamed_cohort(study, cohort, crew) if say is None else streamed_cohort(study, cohort, crew, say)
     population = dataclasses.replace(population, rule=rule, share=1.0 if share is None else float(share.mean))
     fitted = refit(population, candidates, individuals)
-    rules: tuple[Rule, ...] = tuple(dict.fromkeys((rule, "average"))) if alternatives else (rule,)
+    rules: tuple[str, ...] = tuple(dict.fromkeys((rule, "average"))) if alternatives else (rule,)
     best = optima_from(fitted.population, candidates, fitted.sums, rules)
-    others = {"average": best["average"]} if alternatives and rule != "average" else {}
+    others = {name: best[name] for name in rules if name != rule}
     if alternatives:
         others[other_inference(study)] = _by_other_inference(fitted.population, best[rule])
     optimum = best[rule]
@@ -138,25 +138,25 @@ def _that_learns(
     people = dataclasses.replace(study, learnt=None)  # of which each program needs the model alone
     population = streamed_cohort(people, cohort, crew) if say is None else streamed_cohort(people, cohort, crew, say)
     fitted = refit(population, candidates, individuals)
-    rules: tuple[Rule, ...] = ("bcm", "average") if alternatives else ()
+    rules: tuple[str, ...] = ("bcm", "average") if alternatives else ()
     others = optima_from(fitted.population, candidates, fitted.sums, rules) if rules else {}
     return LargeAggregate(
         study, cohort, fitted.population, fitted.certificate, optimum, fitted.individuals, others, map=map_
     )
 
 
-def _streamed(rule: str, people: int) -> Rule:
+def _streamed(rule: str, people: int) -> str:
     """A rule that is a sum over people, as a stream of them needs it."""
-    if rule not in RULES:
+    if rule not in POINTWISE:
         raise InputError(
             f'The rule "{rule}" takes all answers at once, on one device, not in a stream of {people:,} people;'
-            f" use {', '.join(RULES[:-1])} or {RULES[-1]}."
+            f" use {', '.join(POINTWISE[:-1])} or {POINTWISE[-1]}."
         )
     return rule
 
 
 def optima_from(
-    population: StreamedCohort, candidates: Float[np.ndarray, "m d"], totals: Sums, rules: tuple[Rule, ...] = ("bcm",)
+    population: StreamedCohort, candidates: Float[np.ndarray, "m d"], totals: Sums, rules: tuple[str, ...] = ("bcm",)
 ) -> dict[str, Optimum]:
     """The maximum of the map by each rule in the feasible set, from the sums at candidates (m, d)."""
     prior = np.asarray(jax.vmap(population.study.gp.kernel.diagonal)(jnp.asarray(candidates)))
@@ -182,7 +182,7 @@ def _height(optimum: Optimum) -> float:
     return float(optimum.mean)
 
 
-def _by_steps(population: StreamedCohort, best: Optimum, rule: Rule) -> Optimum:
+def _by_steps(population: StreamedCohort, best: Optimum, rule: str) -> Optimum:
     """From an optimum the highest of those a step of whole numbers or levels away, polished, until none is higher."""
     study, neighbours = population.study, population.study.space.searched.get("neighbours")
     if neighbours is None:
@@ -221,10 +221,10 @@ def _optimum_at(
     return Optimum(jnp.asarray(x), mean, jnp.sqrt(variance), chances)
 
 
-def _variance_apart(study: Study, rule: Rule, share: float) -> ArrayLike:
+def _variance_apart(study: Study, rule: str, share: float) -> ArrayLike:
     """Variance of one person's function about the map's, as `RuleMap.apart`."""
     prior = np.asarray(study.gp.kernel.variance)
-    return prior * np.asarray(1.0 - share if rule == "hierarchical" else 0.0, prior.dtype)
+    return prior * np.asarray(1.0 - share if RULES[rule].learns_share else 0.0, prior.dtype)
 
 
 def _separate_rows(values: Float[np.ndarray, " m"], candidates: Float[np.ndarray, "m d"]) -> list[int]:
@@ -257,7 +257,7 @@ def _by_other_inference(population: StreamedCohort, best: Optimum) -> Optimum:
 def optimum_near(
     population: StreamedCohort,
     starts: Float[np.ndarray, "s d"],
-    rules: tuple[Rule, ...],
+    rules: tuple[str, ...],
     *,
     tolerance: float = 0.0,
     words: str = "participants, polishing the optimum",
@@ -270,8 +270,8 @@ def optimum_near(
     study, count = population.study, len(rules)
     slots = _STARTS * -(-count // _STARTS)  # few shapes, few compilations
     rows = np.arange(slots) % count
-    plain = np.array([rule == "average" for rule in rules])[rows]
-    by: tuple[Rule, float] = population.rule, population.share
+    plain = np.array([not RULES[rule].weighted for rule in rules])[rows]
+    by: tuple[str, float] = population.rule, population.share
     w, state = _start_newton(study, np.asarray(starts)[rows])
     for _ in range(_STEPS):
         points = _next_points(study, w, state)
@@ -330,7 +330,7 @@ def _newton_step(
     points: Float[Array, "s d"],
     plain: Bool[ArrayLike, " s"],
     people: Float[Array, ""],
-    by: tuple[Rule, float],
+    by: tuple[str, float],
 ) -> tuple[
     Float[Array, "s d"], PyTree, Bool[Array, " s"], tuple[Float[Array, "s d"], Float[Array, " s"], Float[Array, " s"]]
 ]:

@@ -9,13 +9,12 @@ import numpy as np
 
 from hilbo.errors import InputError
 from hilbo.population.learnt.posterior import Stated, prior_model
-from hilbo.population.learnt.recipes import RECIPES, RECOMMENDED
 from hilbo.population.learnt.rule import Learnt
 from hilbo.population.learnt.sample import learn_from_sample
-from hilbo.population.maps import ALL_RULES, RuleMap
+from hilbo.population.maps import RuleMap
+from hilbo.population.rules.registry import RECIPES, RECOMMENDED, RULES, WITHDRAWN
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.file.schema import WITHDRAWN_RULES
 
 __all__ = ["by_rule", "effect_content", "learnt_content", "learnt_sentences", "resolved", "that_learns"]
 
@@ -34,20 +33,20 @@ def by_rule(study: Study, rule: str) -> Study:
     needs a [gp] where the study learns its own."""
     if rule == study.rule:
         return study
-    if rule in WITHDRAWN_RULES:
-        raise InputError(f"--rule is {WITHDRAWN_RULES[rule]}")
-    if rule not in ALL_RULES:
-        raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
-    if rule in RECIPES:
+    if rule in WITHDRAWN:
+        raise InputError(f"--rule is {WITHDRAWN[rule]}")
+    if rule not in RULES:
+        raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(RULES)}.')
+    if RULES[rule].learns:
         return that_learns(study, rule)
-    if study.rule in RECIPES:
+    if RULES[study.rule].learns:
         raise InputError(f'--rule is "{rule}", and the study, whose rule is "{study.rule}", has no [gp] for it.')
     return dataclasses.replace(study, rule=rule)
 
 
 def resolved(study: Study, cohort: Cohort) -> Study:
     """The study with the model that its answers say, where its rule learns; else the study itself."""
-    if study.rule not in RECIPES or study.learnt is not None:
+    if not RULES[study.rule].learns or study.learnt is not None:
         return study
     learnt = learn_from_sample(cohort.trials, len(study.responses), study.stated, RECIPES[study.rule])
     return dataclasses.replace(study, gp=learnt.model.gp, learnt=learnt)

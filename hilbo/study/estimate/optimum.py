@@ -21,9 +21,9 @@ from hilbo.numerics.shown import shown
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior
 from hilbo.population import pointwise
-from hilbo.population.learnt.recipes import RECIPES
 from hilbo.population.maps import RuleMap
 from hilbo.population.newcomer import class_probabilities, log_highest
+from hilbo.population.rules.registry import RULES
 from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
 from hilbo.study.estimate.best_places import best_places, nearness
@@ -38,7 +38,6 @@ __all__ = [
     "predict_people",
 ]
 
-Rule = pointwise.Rule
 _LOSS = 0.05  # of the probability of the highest answer, for an optimum in the middle of where the best may be
 
 
@@ -60,14 +59,14 @@ class Optimum(eqx.Module):
 
 @program
 def predict_people(
-    posteriors: Posterior, x: Float[Array, "m d"], rule: Rule = "bcm", share: Float[Array, ""] | None = None
+    posteriors: Posterior, x: Float[Array, "m d"], rule: str = "bcm", share: Float[Array, ""] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Mean and variance (m,) of the population map at points of the unit cube, aggregated point by point.
 
     Of bcm, participants' predictions are made in blocks and never held all at once. `share`: of the hierarchical rule.
     """
     prior = jax.vmap(jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel.diagonal)(x)
-    if rule != "bcm":
+    if not RULES[rule].product:
         means, explained = jax.vmap(lambda p: p.predict_explained(x))(posteriors)
         return pointwise.aggregate(rule, means, explained, prior, share=share)
     evidence = bcm.stream(lambda p: p.predict_explained(x), posteriors, prior)
@@ -81,14 +80,16 @@ def predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m
 
 @program
 def _predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    return predict_people(map_.experts, x) if map_.rule == "bcm" and map_.experts is not None else map_.predict(x)
+    if map_.experts is not None and RULES[map_.rule].product:
+        return predict_people(map_.experts, x)
+    return map_.predict(x)
 
 
 def population_optimum(
     study: Study,
     posteriors: Posterior,
     candidates: Float[Array, "m d"],
-    rule: Rule = "bcm",
+    rule: str = "bcm",
     share: Float[Array, ""] | None = None,
 ) -> Optimum:
     """Where the population map's mean is largest in the feasible set.
@@ -123,7 +124,7 @@ def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) ->
 def _nameless(map_: RuleMap) -> RuleMap:
     """The map without the name of its rule where it predicts alike by all: from one function's posterior. One program
     then serves them."""
-    exact = map_.method == "exact" and map_.rule not in RECIPES
+    exact = map_.method == "exact" and not RULES[map_.rule].learns
     return dataclasses.replace(map_, rule="hierarchical") if exact else map_
 
 
@@ -131,7 +132,7 @@ def _nameless(map_: RuleMap) -> RuleMap:
 def _map_optimum(
     likelihood: OrdinalProbit, space: SearchSpace, map_: RuleMap, candidates: Float[Array, "m d"]
 ) -> Optimum:
-    if map_.rule not in RECIPES:
+    if not RULES[map_.rule].learns:
         single = jnp.float32  # which ranks the candidates; the best are scored again
         values = predict_map(map_.astype(single), candidates.astype(single))[0]
         return _optimum(likelihood, space, lambda x: predict_map(map_, x), candidates, values, map_.apart)

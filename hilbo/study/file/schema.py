@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, get_args
 import msgspec
 
 from hilbo.mechanics.span import Memory
+from hilbo.population.rules.registry import DEFAULT, RULES, RuleName
 from hilbo.study.file.fields import NotNegative as _NotNegative
 from hilbo.study.file.fields import Number as _Number
 from hilbo.study.file.fields import Positive as _Positive
@@ -17,10 +18,8 @@ from hilbo.study.file.stimuli import StimulusTable
 from hilbo.study.file.trial_flags import FLAGS, TrialFlag
 
 __all__ = [
-    "LEARN",
     "NO_DELAY",
     "TABLES",
-    "WITHDRAWN_RULES",
     "ConstraintTable",
     "GPTable",
     "Inference",
@@ -28,20 +27,11 @@ __all__ = [
     "ParameterTable",
     "RendererTable",
     "ReportTable",
-    "Rule",
     "Selection",
     "Tables",
 ]
 
 Inference = Literal["laplace", "ep", "ep_corrected", "exact"]
-Rule = Literal["bcm", "hierarchical", "average", "pooled", "learnt-1", "learnt-2"]
-"""How people are aggregated; `hilbo.population.maps` has the rules."""
-LEARN: tuple[Rule, ...] = ("learnt-1", "learnt-2")
-"""The rules that learn what [gp] leaves out."""
-WITHDRAWN_RULES = {
-    "rbcm": '"rbcm", which was withdrawn: it won no comparison; write "learnt-2" (recommended) or "bcm" (the paper\'s).'
-}
-"""Rules of earlier versions, whose names stay reserved: name -> what an error says after "rule is"."""
 Acquisition = Literal["ucb", "log_ei", "thompson", "top_category"]
 
 
@@ -143,7 +133,7 @@ class Selection(_Table, frozen=True):
 
 
 class AggregationTable(_Table, frozen=True):
-    rule: Annotated[Rule, _text("one of " + ", ".join(f'"{name}"' for name in get_args(Rule)), '"bcm"')] = "bcm"
+    rule: Annotated[RuleName, _text("one of " + ", ".join(f'"{name}"' for name in RULES), f'"{DEFAULT}"')] = DEFAULT
 
 
 class RandomEffectTable(_Table, frozen=True):

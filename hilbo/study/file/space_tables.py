@@ -2,25 +2,23 @@
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, get_args
+from typing import Any
 
 import msgspec
 
 from hilbo.errors import InputError
+from hilbo.population.rules.registry import DEFAULT, GIVEN, RECOMMENDED, RULES, WITHDRAWN
 from hilbo.search.box import Box, Constraint, Mechanics, Parameter
 from hilbo.study.file.fields import check_keys, check_present, check_table, missing_keys, read_table, shown
 from hilbo.study.file.reserved_names import TRIAL_COLUMNS, is_reserved
 from hilbo.study.file.schema import (
-    LEARN,
     NO_DELAY,
     TABLES,
-    WITHDRAWN_RULES,
     ConstraintTable,
     GPTable,
     LevelsTable,
     ParameterTable,
     RendererTable,
-    Rule,
     Tables,
 )
 
@@ -74,13 +72,13 @@ def _check_complete(raw: Mapping[str, Any]) -> None:
     missing += (key for name, kind in kinds.items() if name in raw for key in missing_keys(kind, raw[name], name))
     for name, table in check_table(raw.get("parameters", {}), "parameters").items():
         missing += missing_keys(_kind_of(table), _of_one_kind(table, f"parameters.{name}"), f"parameters.{name}")
-    rule = raw.get("aggregation", {}).get("rule", "bcm")  # one that is none is refused with its value
-    if rule in WITHDRAWN_RULES:
-        raise InputError(f"aggregation.rule is {WITHDRAWN_RULES[rule]}")
+    rule = raw.get("aggregation", {}).get("rule", DEFAULT)  # one that is none is refused with its value
+    if rule in WITHDRAWN:
+        raise InputError(f"aggregation.rule is {WITHDRAWN[rule]}")
     stated = {"theta" if key == "length" else key for key in raw.get("gp", {})}
-    fixed = rule not in LEARN and rule in get_args(Rule)
+    fixed = rule in GIVEN
     unstated = [f"gp.{key}" for key in _LEARNT if fixed and key not in stated]
-    hint = f'; rule = "{LEARN[-1]}" in [aggregation] learns what [gp] does not state' if unstated else ""
+    hint = f'; rule = "{RECOMMENDED}" in [aggregation] learns what [gp] does not state' if unstated else ""
     check_present([*missing, *unstated], hint)
 
 
@@ -176,7 +174,7 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
         )
 
 
-def _check_gp(table: GPTable, rule: Rule, count: int) -> None:
+def _check_gp(table: GPTable, rule: str, count: int) -> None:
     """For `count` responses."""
     thresholds = table.thresholds
     if thresholds is not None:
@@ -186,7 +184,7 @@ def _check_gp(table: GPTable, rule: Rule, count: int) -> None:
             )
         if any(low >= high for low, high in itertools.pairwise(thresholds)):
             raise InputError(f"gp.thresholds is {shown(thresholds)}; it must rise from each number to the next.")
-    if rule in LEARN and table.inference != "laplace":
+    if RULES[rule].learns and table.inference != "laplace":
         raise InputError(f'gp.inference is {shown(table.inference)}; it must be "laplace" with rule = "{rule}".')
 
 

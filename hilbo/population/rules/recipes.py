@@ -1,7 +1,8 @@
 """Recipes that learn the hyperparameters from all people's answers.
 
-Each has a name, and never changes: a study that names one gets the same numbers from a later hilbo, but for how near
-the search comes to the maximum, which is hundredths of a standard deviation. A better recipe gets another name.
+Each has its rule's name, and never changes: a study that names one gets the same numbers from a later hilbo, but for
+how near the search comes to the maximum, which is hundredths of a standard deviation. A better recipe gets another
+name.
 
 In units of the classification noise, with d parameters and C categories, people's functions and answers are those of
 `people_model.PeopleModel`. The priors of the hyperparameters:
@@ -15,16 +16,13 @@ In units of the classification noise, with d parameters and C categories, people
     log distance of neighbouring thresholds      log 0.8, 0.7        log 0.8, 2
     log width_j of a person, if C > 2            0, 0.4              the same
     log variance of a random effect, if any      0, 2                the same
-    largest at the optimum                       P(highest answer)   how often the best is near
 """
 
 import math
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
-from hilbo.kernels import RBF, Matern32, Stationary
-
-__all__ = ["EFFECT", "LEARNT_1", "LEARNT_2", "RECIPES", "RECOMMENDED", "WIDTHS", "Prior", "Recipe"]
+__all__ = ["EFFECT", "LEARNT_1", "LEARNT_2", "WIDTHS", "Prior", "Recipe"]
 
 
 class Prior(NamedTuple):
@@ -38,14 +36,10 @@ class Recipe(NamedTuple):
     """What is learnt from answers, and how."""
 
     name: str
-    kernel: type[Stationary]
+    kernel: Literal["rbf", "matern32"]
     """Of the function that people share, and of everybody's own part."""
     priors: Mapping[str, Prior]
     """By the names of `posterior.Coordinates`; that of theta less log d."""
-    centred: bool
-    """The optimum is the place that the best rendering is most often near (`study.best_places.nearness`), of those
-    where a new person gives the highest answer at most 0.05 less often than anywhere. False: where they do so most
-    often."""
 
 
 WIDTHS: Final = Prior(0.0, 0.4)
@@ -55,7 +49,7 @@ EFFECT: Final = Prior(0.0, 2.0)
 
 LEARNT_1: Final = Recipe(
     "learnt-1",
-    RBF,
+    "rbf",
     {
         "theta": Prior(math.log(24.0), 1.2),
         "shared": Prior(math.log(3.0), 1.0),
@@ -65,11 +59,10 @@ LEARNT_1: Final = Recipe(
         "widths": WIDTHS,
         "effect": EFFECT,
     },
-    centred=False,
 )
 LEARNT_2: Final = Recipe(
     "learnt-2",
-    Matern32,
+    "matern32",
     {
         "theta": Prior(math.log(24.0), 1.2),
         "shared": Prior(math.log(3.0), 2.0),
@@ -79,8 +72,4 @@ LEARNT_2: Final = Recipe(
         "widths": WIDTHS,
         "effect": EFFECT,
     },
-    centred=True,
 )
-RECIPES: Final = {recipe.name: recipe for recipe in (LEARNT_1, LEARNT_2)}
-RECOMMENDED: Final = LEARNT_2.name
-"""What is shown beside a study's own rule."""

@@ -1,0 +1,151 @@
+"""The rules of aggregation: the one list of them, and what is true of each.
+
+A rule says how people's answers become one population map and what is taken for its optimum. Study files, `--rule` and
+result.json hold its name; all else that depends on the rule is asked of `RULES[name]`. `hilbo.population.maps` fits the
+maps. A new rule is a new entry here, with its recipe (`recipes`) if it learns the hyperparameters.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+from hilbo.population.rules.recipes import LEARNT_1, LEARNT_2, Recipe
+
+__all__ = ["DEFAULT", "GIVEN", "POINTWISE", "RECIPES", "RECOMMENDED", "RULES", "WITHDRAWN", "Rule", "RuleName"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rule:
+    """A rule of aggregation."""
+
+    name: str
+    """In study files and results; never changes."""
+    label: str
+    """Of an optimum by it, on pages."""
+    description: str
+    """Of its model, in a pre-registration."""
+    sought: str = "the maximum of the population map"
+    """What is taken for the optimum, in a pre-registration;"""
+    place: str = "where the aggregated map is highest"
+    """The same on pages, with {top} for the highest answer."""
+    formula: str = ""
+    """Of variance and mean of the map, as HTML, where it is short enough for a page."""
+    pointwise: str
+    """The rule by which posteriors are combined point by point where this one has no map of all answers: itself, if it
+    is a sum over people at each point (`hilbo.population.pointwise`)."""
+    weighted: bool = True
+    """Whether that sum weights people by their precision; otherwise everybody counts the same."""
+    learns_share: bool = False
+    """Whether the share of the prior variance that people have in common is learnt, which takes two people."""
+    homogeneous: bool = False
+    """Whether people are assumed to have one function in common: where they differ, its intervals are too narrow."""
+    joint: bool = False
+    """Whether one model is fitted to all answers at once, where they are few enough;"""
+    exact_only: bool = False
+    """and nothing stands in for it where they are too many."""
+    recipe: Recipe | None = None
+    """Of a rule that learns the hyperparameters; others take them from [gp]."""
+    centred: bool = False
+    """Whether the optimum is the place that the best rendering is most often near (`study.best_places.nearness`), of
+    those where a new person gives the highest answer at most 0.05 less often than anywhere."""
+
+    @property
+    def learns(self) -> bool:
+        """Whether it learns the hyperparameters, so that a study needs no [gp]."""
+        return self.recipe is not None
+
+    @property
+    def by_points(self) -> bool:
+        """Whether it is a sum over people at each point."""
+        return self.pointwise == self.name
+
+    @property
+    def product(self) -> bool:
+        """Whether the map is a product of people's posteriors: it may be made as a stream, and has joint draws."""
+        return self.by_points and self.weighted and not self.learns_share
+
+    @property
+    def least_people(self) -> int:
+        """Fewest people with answers."""
+        return 2 if self.learns_share else 1
+
+
+_LEARNT = "the hierarchical model with hyperparameters learnt from all answers, recipe "
+_ALL: Final = (
+    Rule(
+        name="bcm",
+        label="committee machine (bcm)",
+        description="the Bayesian committee machine",
+        formula="1/σ² = Σ<sub>j</sub> 1/σ<sub>j</sub>² − (M − 1)/<i>k</i> and"
+        " μ = σ² Σ<sub>j</sub> μ<sub>j</sub>/σ<sub>j</sub>²",
+        pointwise="bcm",
+        homogeneous=True,
+    ),
+    Rule(
+        name="hierarchical",
+        label="people who differ (hierarchical)",
+        description="the hierarchical model, with a learnt share that people have in common",
+        pointwise="hierarchical",
+        learns_share=True,
+        joint=True,
+    ),
+    Rule(
+        name="average",
+        label="plain average of the latent functions",
+        description="the plain average of people's latent functions",
+        pointwise="average",
+        weighted=False,
+    ),
+    Rule(
+        name="pooled",
+        label="one model of all answers",
+        description="one function fitted to all answers",
+        pointwise="bcm",
+        homogeneous=True,
+        joint=True,
+        exact_only=True,
+    ),
+    Rule(
+        name="learnt-1",
+        label="people who differ, hyperparameters learnt (learnt-1)",
+        description=f"{_LEARNT}learnt-1",
+        sought="the one to which a new person most probably gives the highest answer",
+        place='where a new person most probably answers "{top}"',
+        pointwise="hierarchical",
+        joint=True,
+        recipe=LEARNT_1,
+    ),
+    Rule(
+        name="learnt-2",
+        label="people who differ, hyperparameters learnt (learnt-2)",
+        description=f"{_LEARNT}learnt-2",
+        sought="the place that the best one is most often near, of those to which a new person gives the highest"
+        " answer at most 0.05 less often than to any",
+        place="the place that the best rendering is most often near",
+        pointwise="hierarchical",
+        joint=True,
+        recipe=LEARNT_2,
+        centred=True,
+    ),
+)
+RULES: Final = {rule.name: rule for rule in _ALL}
+"""Every rule by its name."""
+if TYPE_CHECKING:
+    RuleName = str
+else:
+    RuleName = Literal[tuple(RULES)]
+"""Of a rule, checked where files are read; a Literal, since msgspec leaves a default out of a study's content, and so
+of its hash, only where the value is that very text."""
+GIVEN: Final = tuple(rule.name for rule in _ALL if not rule.learns)
+"""Those that take the hyperparameters as they are given."""
+POINTWISE: Final = tuple(rule.name for rule in _ALL if rule.by_points)
+"""Those that are sums over people at each point."""
+RECIPES: Final = {rule.name: rule.recipe for rule in _ALL if rule.recipe is not None}
+"""What those learn by that learn."""
+DEFAULT: Final = "bcm"
+"""Of a study file that names none: the paper's."""
+RECOMMENDED: Final = "learnt-2"
+"""What is shown beside a study's own rule."""
+WITHDRAWN: Final = {
+    "rbcm": '"rbcm", which was withdrawn: it won no comparison; write "learnt-2" (recommended) or "bcm" (the paper\'s).'
+}
+"""Rules of earlier versions, whose names stay reserved: name -> what an error says after "rule is"."""
