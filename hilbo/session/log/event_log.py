@@ -26,6 +26,9 @@ from hilbo.study.formats.json_file import read_bytes
 __all__ = ["EventLog", "LogError", "LogLostError", "read_log", "read_session"]
 
 _MODE = 0o600
+_OPEN = (
+    os.O_RDWR | os.O_APPEND | getattr(os, "O_BINARY", 0)
+)  # appended, so that a cut file does not get a hole of zeros
 
 
 class LogError(RuntimeError):
@@ -68,7 +71,7 @@ class EventLog:
         check_new_header(study, header)
         try:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+            flags = _OPEN | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
             file = os.open(path, flags, _MODE)
         except OSError as error:
             raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder.") from error
@@ -92,7 +95,7 @@ class EventLog:
         """Open a log to go on with it; a last line that is not whole is cut off. Raises InputError."""
         path = Path(path)
         try:
-            file = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
+            file = os.open(path, _OPEN)
         except FileNotFoundError:
             raise InputError(f"{path}: is not there, no such session was begun; begin it without --resume.") from None
         except OSError as error:
@@ -148,7 +151,6 @@ class EventLog:
             if self._torn:
                 _cut(self._file, self._size)
                 self._torn = False
-            os.lseek(self._file, self._size, os.SEEK_SET)
             left = memoryview(line)
             while left:
                 left = left[os.write(self._file, left) :]
@@ -206,7 +208,6 @@ def _end(file, path, content, size):
         if size < len(content):
             os.ftruncate(file, size)
         else:
-            os.lseek(file, len(content), os.SEEK_SET)
             os.write(file, b"\n")
         os.fsync(file)
     except OSError as error:
