@@ -1,4 +1,4 @@
-"""How a recorded test begins and which signs it has: offsets of one channel, and channels that oppose each other."""
+"""Checks of the start of a recorded test: an offset in one channel, and the correlation of the two channels."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,44 +8,49 @@ __all__ = ["correlation", "off_zero", "untared"]
 _OFF_ZERO, _MOVED = 0.03, 0.2  # of a curve's range
 
 
-def untared(put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> str | None:
-    """Which has an offset, "input" or "output": its first row is not 0, although the other's is. (m,) each.
+def untared(applied: Float[np.ndarray, " m"], measured: Float[np.ndarray, " m"]) -> str | None:
+    """Name the channel with an untared offset, "input" or "output"; None if there is none.
 
-    A step in the first row itself looks alike, but there the other one moves while this one stays.
+    That channel is clearly not 0 in its first row, while the other one is. A step in the first row looks the same, but
+    there the other channel moves while this one stays constant. `applied`, `measured`: (m,) each.
     """
-    name = off_zero(put, out)
-    held, other = (put, out) if name == "input" else (out, put)
-    leaves = np.abs(held - held[0]) > max(0.05, 4 * _jitter(held)) * np.ptp(held)
-    before = int(np.argmax(leaves)) if leaves.any() else held.size
-    return name if np.ptp(other[:before]) <= _MOVED * np.ptp(other) else None
+    name = off_zero(applied, measured)
+    suspect, other = (applied, measured) if name == "input" else (measured, applied)
+    has_moved = np.abs(suspect - suspect[0]) > max(0.05, 4 * _jitter(suspect)) * np.ptp(suspect)
+    first_moved = int(np.argmax(has_moved)) if has_moved.any() else suspect.size
+    return name if np.ptp(other[:first_moved]) <= _MOVED * np.ptp(other) else None
 
 
-def off_zero(put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> str | None:
-    """Which, "input" or "output", is clearly not 0 in the first row, where the other one is."""
-    for name, one, other in (("input", put, out), ("output", out, put)):
-        height = _height(one)
+def off_zero(applied: Float[np.ndarray, " m"], measured: Float[np.ndarray, " m"]) -> str | None:
+    """Name the channel that is clearly not 0 in the first row while the other is 0, "input" or "output"; else None."""
+    for name, values, other in (("input", applied, measured), ("output", measured, applied)):
+        height = _height(values)
         zero = _height(other) <= max(0.1 * min(height, 1.0), 2 * _jitter(other))
-        if zero and height > max(_OFF_ZERO, 6 * _jitter(one)):
+        if zero and height > max(_OFF_ZERO, 6 * _jitter(values)):
             return name
     return None
 
 
 def _height(values: Float[np.ndarray, " m"]) -> float:
-    """The first of the values, over their range."""
+    """Absolute first value divided by the range of the values; inf for a constant that is not 0."""
     first, width = abs(values[0]), np.ptp(values)
     return float(first / width) if width > 0 else np.inf if first > 0 else 0.0
 
 
 def _jitter(values: Float[np.ndarray, " m"]) -> float:
-    """Standard deviation of the noise from row to row, over the range of the values."""
+    """Standard deviation of the row-to-row noise, divided by the range of the values (0 for a constant)."""
     second = np.abs(np.diff(values, 2))  # has the variance of six samples
     return float(1.4826 * np.median(second) / np.sqrt(6) / (np.ptp(values) or np.inf))
 
 
-def correlation(time: Float[np.ndarray, " m"], put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> float:
-    """Of two curves about 0, over the time; nan where one of them is 0.
+def correlation(
+    time: Float[np.ndarray, " m"], applied: Float[np.ndarray, " m"], measured: Float[np.ndarray, " m"]
+) -> float:
+    """Correlation about 0 (not about the mean) of two curves over time; nan if one of them is 0 throughout.
 
-    A storage modulus is above 0 at every frequency, and so is this of whatever a material can do from rest.
+    The storage modulus of any material is positive at every frequency, so this is positive for any motion from rest.
     """
-    both, ones, others = (np.trapezoid(product, time) for product in (put * out, put * put, out * out))
-    return float(both / np.sqrt(ones * others)) if ones * others > 0 else np.nan
+    cross, applied_2, measured_2 = (
+        np.trapezoid(product, time) for product in (applied * measured, applied * applied, measured * measured)
+    )
+    return float(cross / np.sqrt(applied_2 * measured_2)) if applied_2 * measured_2 > 0 else np.nan

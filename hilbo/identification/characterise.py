@@ -1,9 +1,9 @@
-"""Identification of a material from its tests: fit, intervals, residuals, memory, passivity.
+"""Full characterisation of a material from its tests: fit, intervals, residuals, memory and passivity.
 
-There is always a best fit (`Characterisation.fit`). Whether the data determine a parameter is its status: *identified*
-if its 95 % profile interval has two ends, *one-sided* if it has one, *at bound* if the fit ran to the edge of the
-search, *not identifiable* if the interval has no end. K0, K1 and B1 follow from all four coordinates; their intervals
-are quantiles under the normal approximation of the coordinates.
+The best curve is always reported (`Characterisation.fit`). Each parameter has a status: *identified* if its 95 %
+profile interval has two ends, *one-sided* if it has one, *at bound* if the fit ended at a bound of the search, and *not
+identifiable* if the data determine no end. K0, K1 and B1 are functions of all four coordinates; their intervals are
+quantiles under the normal approximation of the coordinates.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -27,13 +27,17 @@ from hilbo.identification.sentences import sentences
 __all__ = ["Characterisation", "Estimate", "characterise"]
 
 _DRAWS = 4000
-_RESTARTS = 3  # from a better place that the search for intervals came through
+_RESTARTS = 3  # from a better point met during the interval search
 _ROUNDING = 1e-12  # of the largest value; repeats that differ less are copies
 _FILTERED = 4.0  # standard deviations, above which a filter of the force is fitted
 
 
 class Characterisation(NamedTuple):
-    """A fit and its uncertainty; `estimates` by name, `noise` by kind of test."""
+    """Results of `characterise`; `estimates` and `bootstrap` by parameter name, `noise` and `nrmse` by kind of test.
+
+    `bootstrap` holds interval ends, None for fewer than 5 repeats; `freedom`: degrees of freedom; `minimum_damping` in
+    N·s/m; `rows`: the fits with other memories.
+    """
 
     fit: Fit
     estimates: dict[str, Estimate]
@@ -55,9 +59,11 @@ def characterise(
     *,
     find_filter: bool = True,
 ) -> Characterisation:
-    """Fit tests by one parameter set and judge it; `choices` are the memories to compare (none: no comparison).
+    """Fit one parameter set to the tests; compute intervals, residual noise, minimum damping and warnings.
 
-    `find_filter`: a `Sampled` with `lag="fit"` and no filter gets one where the residuals ask for it (`misfit`).
+    `choices`: memory lengths to compare (none: no comparison). `say` receives the name of each step for progress
+    output. `find_filter`: a `Sampled` with `lag="fit"` and no filter is fitted with one if the residuals indicate it
+    (`misfit`).
     """
     say("fitting")
     best_fit, sides = _fitted(tests, model, say, find_filter)
@@ -84,7 +90,10 @@ def characterise(
 def _fitted(
     tests: Sequence[Test], model: Any, say: Callable[[str], None], find_filter: bool
 ) -> tuple[Fit, intervals.Intervals]:
-    """The best fit and its intervals, with what of the instrument can be fitted."""
+    """Best fit and its profile intervals; lag and filter are fitted if the model asks for it and the data allow it.
+
+    The fit is restarted up to three times from a better point that the interval search came across.
+    """
     fits_lag = isinstance(model, Sampled) and model.lag == "fit"
     if fits_lag and not can_be_timed(tests):
         model = Sampled(model.N, model.T, model.memory, lag=0.0, corner=model.corner)
@@ -105,7 +114,7 @@ def _fitted(
 
 
 def _instrument(best_fit: Fit) -> tuple[float, float]:
-    """Lag (s) and corner (Hz) of a fit, as they are held for fits with other memories."""
+    """Lag (s) and filter corner (Hz) of a fit, to be kept fixed in fits with other memories."""
     model = best_fit.model
     named = dict(zip(model.labels, np.asarray(model.natural(best_fit.q)).tolist(), strict=True))
     lag = 1e-3 * named["lag"] if "lag" in named else float(model.lag)
@@ -113,28 +122,34 @@ def _instrument(best_fit: Fit) -> tuple[float, float]:
 
 
 def _estimates(best_fit: Fit, sides: intervals.Intervals, sampling: intervals.Spread, seed: int) -> dict[str, Estimate]:
-    """Every parameter and coordinate by name: coordinates from their profiles, the others by `_quantiles`."""
-    model, labels, held = best_fit.model, best_fit.model.labels, np.asarray(best_fit.held())
+    """Estimates of all parameters and coordinates by name.
+
+    Coordinates have profile intervals, the other parameters quantiles.
+    """
+    model, labels, at_bound = best_fit.model, best_fit.model.labels, np.asarray(best_fit.held())
     open_lower, open_upper = np.asarray(sides.open_lower), np.asarray(sides.open_upper)
     ok = np.asarray(sides.bracketed) & np.isfinite(np.asarray(sides.lower)) & np.isfinite(np.asarray(sides.upper))
     value, lower, upper = (np.asarray(model.natural(q)) for q in (best_fit.q, sides.lower, sides.upper))
     estimates = {}
     for j, name in enumerate(labels):
-        status = _status(ok[j] and bool(best_fit.solution.converged), open_lower[j], open_upper[j], held[j])
+        status = _status(ok[j] and bool(best_fit.solution.converged), open_lower[j], open_upper[j], at_bound[j])
         low = float(lower[j]) if ok[j] and not open_lower[j] else None
         high = float(upper[j]) if ok[j] and not open_upper[j] else None
         estimates[name] = Estimate(float(value[j]), low, high, status)
-    whole = all(estimate.known for estimate in estimates.values())
-    derived = _quantiles(best_fit, sampling, seed) if whole else {}
+    all_identified = all(estimate.known for estimate in estimates.values())
+    derived = _quantiles(best_fit, sampling, seed) if all_identified else {}
     others = {name: number for name, number in best_fit.parameters().items() if name not in labels}
-    status = "identified" if whole else "not identifiable"
+    status = "identified" if all_identified else "not identifiable"
     ends = {name: derived.get(name, (None, None)) for name in others}
     return {name: Estimate(value, ends[name][0], ends[name][1], status) for name, value in others.items()} | estimates
 
 
-def _status(ok, open_lower, open_upper, held) -> str:
-    """What an estimate is worth, in the words of this module's head; `ok`: both searches for an end came to one."""
-    if held:
+def _status(ok, open_lower, open_upper, at_bound) -> str:
+    """Status of an estimate, as defined in this module's docstring.
+
+    `ok`: both interval searches and the fit converged; `at_bound`: the fit ended at a bound.
+    """
+    if at_bound:
         return "at bound"
     if not ok or (open_lower and open_upper):
         return "not identifiable"
@@ -142,7 +157,7 @@ def _status(ok, open_lower, open_upper, held) -> str:
 
 
 def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str, list[float]]:
-    """95 % intervals of the derived parameters, from draws of the coordinates."""
+    """95 % intervals of the derived parameters, from normal draws of the coordinates."""
     rng = np.random.default_rng(seed)
     draws = rng.multivariate_normal(np.asarray(best_fit.q), np.asarray(sampling.covariance), _DRAWS, method="eigh")
     sets = jax.vmap(best_fit.model.parameters)(jnp.asarray(draws))
@@ -150,7 +165,7 @@ def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str
 
 
 def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
-    """What the residuals of each test look like, and how they compare with the noise of the repeats."""
+    """Yield for each test the description of its residuals, and their size relative to the noise of the repeats."""
     for test, curve, autoregression in zip(tests, best_fit.curves, noise(best_fit), strict=True):
         values = np.asarray(test.output if curve.other_way is None else test.input)
         row = {
@@ -164,13 +179,16 @@ def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
         if test.repeats > 1:
             scatter = np.sqrt(np.mean(np.var(values, axis=0, ddof=1)) / test.repeats)
             size = float(autoregression.rms) * np.ptp(values.mean(axis=0))
-            if scatter > _ROUNDING * np.max(np.abs(values)):  # copies tell nothing about noise
+            if scatter > _ROUNDING * np.max(np.abs(values)):  # identical repeats have no noise to compare with
                 row["over_repeat_noise"] = float(size / scatter)
         yield row
 
 
 def _minimum_damping(best_fit: Fit) -> float | None:
-    """Smallest passive damping of the set, N·s/m; None for an even number of taps (closed form too low) and moduli."""
+    """Smallest device damping (N·s/m) with which the fitted set is passive.
+
+    None for moduli, and for an even number of taps, where the closed form is too low.
+    """
     model, values = best_fit.model, best_fit.parameters()
     if not isinstance(model, Sampled) or (model.memory == "short" and int(model.N) % 2 == 0):
         return None

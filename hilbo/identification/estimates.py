@@ -6,7 +6,7 @@ __all__ = ["Estimate"]
 
 
 class Estimate(NamedTuple):
-    """A parameter: the value of the best curve, its 95 % interval (an open end is None), and what it is worth."""
+    """Estimate of a parameter: fitted value, 95 % interval (None for an open end) and identifiability status."""
 
     value: float
     lower: float | None
@@ -15,5 +15,5 @@ class Estimate(NamedTuple):
 
     @property
     def known(self) -> bool:
-        """Whether the digits of `value` mean something."""
+        """Whether the parameter is identified, so that its digits are meaningful."""
         return self.status == "identified"

@@ -1,12 +1,11 @@
-"""From creep and relaxation tests to the parameters of the FO-SLS that make the same curves.
+"""Fit of a material model to creep and relaxation tests: tests, curves, models and the least-squares search.
 
-What was measured is fitted: the recorded input (position in relaxation, force in creep) goes through a model
-(`sampled`) and its output is compared, so that no ideal step is assumed. Modulus data G(t), J(t) have no input; they
-are fitted by exact forms (`moduli`). A model has four coordinates or more, bounds and starts; this module brings
-models and tests together.
+The model is driven by the recorded input (position in relaxation, force in creep; `sampled`) and its output is compared
+with the recorded one, so no ideal step is assumed. Modulus data G(t), J(t) have no input; they are fitted by exact
+forms (`moduli`). A model has four coordinates or more, with bounds and starting points.
 
-Residuals are divided by the range of their curve; the cost is the sum over tests of NRMSE².
-Units: N, mm, s; B1 N·s^α/mm. Moduli keep their own unit.
+Residuals are divided by the range of their curve; the cost is the sum over tests of NRMSE². Units: N, mm, s; B1
+N·s^α/mm. Moduli keep their own unit.
 """
 
 from collections.abc import Sequence
@@ -44,16 +43,16 @@ _RACE, _LONGEST = 12, 200  # steps of every start, and of the best one
 
 
 class Test(eqx.Module):
-    """One kind of test and its repeats, which share their times.
+    """One kind of test with its repeats, which share their times.
 
     `time` (m,) in s, increasing; `output` (R, m): force (N) of relaxation, position (mm) of creep, modulus or
     compliance; `input` (R, m): the position (mm) or force (N) that was applied, None for moduli. Before the first row
-    the material is at rest with no input (`start="rest"`), or in equilibrium with the first one.
-    Position and force of a push have one sign, whichever. Raises `InputError` for too few points, times that do not
-    increase, numbers that are not finite, flat curves, and opposite signs.
+    the material is at rest with no input (`start="rest"`), or in equilibrium with the first one. Position and force of
+    a push must have the same sign. Raises `InputError` for too few points, times that do not increase, numbers that are
+    not finite, flat curves, and opposite signs.
     """
 
-    __test__ = False  # no test of pytest's
+    __test__ = False  # keeps pytest from collecting it
 
     kind: Kind = eqx.field(static=True)
     time: Float[np.ndarray, " m"]
@@ -80,31 +79,33 @@ class Test(eqx.Module):
         self._check_signs()
 
     def _check_signs(self):
-        """Refuse a repeat whose position and force oppose each other."""
-        for place, (put, out) in enumerate(zip(() if self.input is None else self.input, self.output, strict=False), 1):
-            opposed = correlation(self.time, put, out) < _OPPOSED
-            changes = correlation(self.time, put - put[0], out - out[0])
+        """Raise `InputError` for a repeat whose position and force have opposite signs."""
+        for repeat, (applied, measured) in enumerate(
+            zip(() if self.input is None else self.input, self.output, strict=False), 1
+        ):
+            opposed = correlation(self.time, applied, measured) < _OPPOSED
+            changes = correlation(self.time, applied - applied[0], measured - measured[0])
             if self.start == "equilibrium":
                 opposed = changes < _OPPOSED
-            elif off_zero(put, out):  # an offset of one of them is no opposite sign
+            elif off_zero(applied, measured):  # an offset of one of them is no opposite sign
                 opposed = opposed and not changes >= _OPPOSED
             if opposed:
-                which = f" in repeat {place} of {self.repeats} (counted from 1)" if self.repeats > 1 else ""
+                which = f" in repeat {repeat} of {self.repeats} (counted from 1)" if self.repeats > 1 else ""
                 fault = f"The {self.kind} test has position and force of opposite signs{which}"
                 raise InputError(f"{fault}; multiply one of them by -1.")
 
     @property
     def repeats(self) -> int:
-        """How often it was done."""
+        """Number of repeats R."""
         return self.output.shape[0]
 
 
 @runtime_checkable
 class Model(Protocol):
-    """What is fitted: a prediction of p coordinates q, with bounds and starts that the data suggest.
+    """Interface of a model that can be fitted: prediction from p coordinates q, with bounds and starting points.
 
-    `sampled.Sampled`, `moduli.Continuous` and `moduli.FractionalMaxwell`. `labels` name the coordinates, `kinds` the
-    tests that it can make.
+    Implemented by `sampled.Sampled`, `moduli.Continuous` and `moduli.FractionalMaxwell`. `labels`: names of the
+    coordinates; `kinds`: kinds of test that it can predict.
     """
 
     kinds: tuple[str, ...]
@@ -115,47 +116,47 @@ class Model(Protocol):
         ...
 
     def physical(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-        """Which lower and upper bounds are limits of nature, such as a stiffness of 0, and not of the search. (p,)."""
+        """Masks of the lower and upper bounds that are physical limits, such as stiffness 0. Two tuples (p,)."""
         ...
 
     def at(self, tests: Sequence[Test]) -> "Model":
-        """The same model, made ready for the times of the tests."""
+        """Copy of the model adapted to the times of the tests."""
         ...
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest q, (p,) each."""
+        """Lower and upper bounds of q, (p,) each."""
         ...
 
     def starts(self, tests: Sequence[Test]) -> np.ndarray:
-        """Where the search begins, (s, p)."""
+        """Starting points of the search, (s, p)."""
         ...
 
     def prepare(self, test: Test) -> "Curve":
-        """A test as this model needs it."""
+        """Convert a test to the `Curve` that this model predicts."""
         ...
 
     def predict(self, q: Array, curve: "Curve", weights: Array) -> Array:
-        """The curve's output (m,) at the coordinates q (p,), under `weights` (R,) of the repeats."""
+        """Predicted output (m,) of the curve at coordinates q (p,), for `weights` (R,) of the repeats."""
         ...
 
     def natural(self, q: Array) -> Array:
-        """q (p,) under its labels, in physical units."""
+        """Coordinates q (p,) converted to the physical units of their labels."""
         ...
 
     def parameters(self, q: Array) -> dict[str, Array]:
-        """Name -> value in physical units, at q (p,)."""
+        """Physical parameters by name, at q (p,)."""
         ...
 
 
 class Curve(eqx.Module):
-    """A test made ready for one model: its mean over weighted repeats is what is fitted.
+    """A test prepared for one model: the weighted mean of its repeats is fitted.
 
-    The model is linear in its input, so the mean of the repeats is the response to the mean of their inputs, exactly.
-    `spectra` (R, L/2+1): damped transforms of the inputs on the model's time grid; `before`, `share`: where the
-    measured times lie on it; `scale`: what residuals are divided by; `changes`: transforms of those changes of
-    the inputs from one sample to the next, without noise (`instrument`); `regular`: there is a row for each sample of
-    the model; `rounded_*`: the rounding of a channel (`rounding`), where that is above its noise; `other_way`: the same
-    test with input and output exchanged, if it is fitted like that.
+    The model is linear in its input, so the mean of the repeats is exactly the response to the mean of their inputs.
+    `spectra` (R, L/2+1): damped transforms of the inputs on the model's time grid; `before`, `share`: index of the grid
+    sample before each measured time, and the fraction of a sample beyond it; `scale`: divisor of the residuals;
+    `changes`: transforms of the significant sample-to-sample changes of the inputs (`instrument`); `regular`: the rows
+    coincide with the samples of the model; `rounded_*`: quantisation of a channel (`rounding`) where it exceeds the
+    noise; `other_way`: the test with input and output exchanged, if it is fitted in that form.
     """
 
     kind: Kind = eqx.field(static=True)
@@ -175,15 +176,15 @@ class Curve(eqx.Module):
 
     @property
     def fitted(self) -> "Curve":
-        """The curve whose residuals are minimised."""
+        """The curve whose residuals are minimised: `other_way` if there is one, else this one."""
         return self if self.other_way is None else self.other_way
 
 
 class Fit(eqx.Module):
-    """The best fit of a model to tests.
+    """Best fit of a model to tests.
 
-    `solution` is its minimum (`least_squares.Solution`), `start_costs` those that the starts ended in, `weights` (R,)
-    of the repeats of each curve.
+    `solution`: result of the search (`least_squares.Solution`); `start_costs`: cost reached from each starting point;
+    `weights` (R,) of the repeats of each curve.
     """
 
     model: Any  # a Model
@@ -196,11 +197,11 @@ class Fit(eqx.Module):
 
     @property
     def q(self) -> Float[Array, " p"]:
-        """The coordinates of the fit. (p,)."""
+        """Fitted coordinates. (p,)."""
         return self.solution.q
 
     def parameters(self) -> dict[str, float]:
-        """The parameter set in physical units."""
+        """Fitted parameters by name, in physical units."""
         return {name: float(value) for name, value in self.model.parameters(self.q).items()}
 
     def minimum(
@@ -217,22 +218,21 @@ class Fit(eqx.Module):
         return least_squares(lambda q: residuals(self.model, self.curves, others, q), start, *ends, **search)
 
     def held(self) -> Bool[Array, " p"]:
-        """Whether each coordinate is within a millionth of the box's width of a bound, out of which the data pull it.
-        (p,)."""
+        """Whether each fitted coordinate is at a bound (within a millionth of the range between the bounds). (p,)."""
         at_lower, at_upper = self.bounded(self.q)
         return at_lower | at_upper
 
     def bounded(self, q: Float[Array, " p"]) -> tuple[Bool[Array, " p"], Bool[Array, " p"]]:
-        """Whether each coordinate of q (p,) stands at its lower, and at its upper bound. Two arrays (p,)."""
-        reach = 1e-6 * (self.upper - self.lower)
-        return q - self.lower <= reach, self.upper - q <= reach
+        """Whether each coordinate of q (p,) is at its lower bound, and whether at its upper bound. Two arrays (p,)."""
+        tolerance = 1e-6 * (self.upper - self.lower)
+        return q - self.lower <= tolerance, self.upper - q <= tolerance
 
 
 def fit(tests: Sequence[Test], model: Any) -> Fit:
-    """Fit one parameter set to all tests; pass one test for a fit of its own.
+    """Fit one parameter set jointly to all tests.
 
-    Every start of the model takes a few steps in one compiled call, and the best one is followed to the end.
-    Raises `InputError` for tests the model cannot make.
+    All starting points of the model take a few steps in one compiled call; the best one is iterated to convergence.
+    Raises `InputError` for no tests, and for tests that the model cannot predict.
     """
     if not tests:
         raise InputError("There is no test to fit.")
@@ -248,7 +248,7 @@ def fit(tests: Sequence[Test], model: Any) -> Fit:
 
 
 def polish(fitted: Fit, start: Float[Array, " p"]) -> Fit:
-    """The fit found from another start, if that is better. `start` (p,)."""
+    """Refit from another starting point `start` (p,); return the better of the two fits."""
     again = _polished(fitted, start)
     better = again.cost < fitted.solution.cost
     return eqx.tree_at(lambda f: f.solution, fitted, again) if better else fitted
@@ -256,36 +256,33 @@ def polish(fitted: Fit, start: Float[Array, " p"]) -> Fit:
 
 @program
 def _polished(current: Fit, start: Float[Array, " p"]) -> Solution:
-    """The minimum to which the search leads from another start."""
+    """Minimum found from the starting point `start` (p,)."""
     return current.minimum(start, max_steps=_LONGEST)
 
 
 def residuals(
     model: Any, curves: Sequence["Curve"], weights: Sequence[Float[Array, " _"]], q: Float[Array, " p"]
 ) -> Float[Array, " m"]:
-    """Residuals of all curves; their sum of squares is the sum over curves of NRMSE².
-
-    `q` (p,) -> (m,), all curves one after the other.
-    """
+    """Concatenated residuals (m,) of all curves at q (p,); their sum of squares is the sum over curves of NRMSE²."""
     return jnp.concatenate([curve_residuals(model, c, w, q) for c, w in zip(curves, weights, strict=True)])
 
 
 def curve_residuals(model: Any, curve: Curve, weights: Float[Array, " R"], q: Float[Array, " p"]) -> Float[Array, " m"]:
-    """Mean of the weighted repeats less the model's, over the curve's scale and the root of its length.
+    """Residuals of one curve: (weighted mean of the repeats - prediction) / (scale·√m).
 
-    `weights` (R,), `q` (p,) -> (m,), without unit.
+    `weights` (R,), `q` (p,) -> (m,), dimensionless. A curve with `other_way` is compared in that form.
     """
     return _misfit(model, curve.fitted, weights, q)
 
 
 def _misfit(model: Any, curve: Curve, weights: Float[Array, " R"], q: Float[Array, " p"]) -> Float[Array, " m"]:
-    """The same in the output of the test."""
+    """Residuals as `curve_residuals`, but for the curve as given, without exchanging input and output."""
     misfit = weights @ curve.output - model.predict(q, curve, weights)
     return misfit / (curve.scale * np.sqrt(curve.time.size).astype(curve.scale.dtype))
 
 
 def nrmse(fitted: Fit) -> dict[str, float]:
-    """Root mean square of each test's residuals over its range. Kind of test -> share of the range, without unit."""
+    """NRMSE of each test in its own output: kind of test -> root mean square residual / range of the curve."""
     parts = [_misfit(fitted.model, c, w, fitted.q) for c, w in zip(fitted.curves, fitted.weights, strict=True)]
     return {c.kind: float(jnp.linalg.norm(r)) for c, r in zip(fitted.curves, parts, strict=True)}
 
@@ -299,9 +296,9 @@ def search(
     lower: Float[Array, " p"],
     upper: Float[Array, " p"],
 ) -> tuple[Solution, Float[Array, " s"]]:
-    """All starts for a few steps, the best of them to the end; with the costs that the race ended in.
+    """Run all starting points for a few steps and iterate the best one to convergence.
 
-    `starts` (s, p), `lower` and `upper` (p,).
+    `starts` (s, p), `lower` and `upper` (p,) -> the solution, and the cost (s,) after the first steps of each start.
     """
 
     def run(start, steps):

@@ -1,20 +1,19 @@
-"""What a force channel does to a recorded test: a lag against the position, and a first-order filter.
+"""Model of the force channel in a recorded test: a lag relative to the position, and a first-order low-pass filter.
 
 The recorded force is F_r(t) = (A F)(t - d): d is the lag (negative where the position is late), A a low-pass filter of
-first order with the time constant τ. All parts are linear and do not change with time, so that the recorded force is
-also that of the position (A x)(t - d), and (A⁻¹ F_r)(t + d) the force of the recorded position. Between two samples a
-signal is taken as a straight line, for which all of them are exact:
+first order with the time constant τ. Both are linear and time-invariant, so the recorded force is also that of the
+position (A x)(t - d), and (A⁻¹ F_r)(t + d) the force of the recorded position. Between two samples a signal is taken as
+a straight line, for which these formulas are exact:
 
     x(t + s)  = x + s·z·Δ (s >= 0),  x + s·Δ (s < 0),      Δ_n = x_n - x_{n-1},  |s| <= 1 sample
     A x       = x - g/(1 - e/z)·Δ,                          e = exp(-T/τ),  g = (1 - e)·τ/T
     A⁻¹ F     = F + g/((1 - g) + (g - e)/z)·Δ
     (A x)(t - f) = x - (f + τ·(1 - E)/T + E·g/(z - e))·Δ,   E = exp(-(T - f)/τ), 0 <= f < T
 
-They act on the input of a curve, the position or the force of a creep test. Where its changes Δ do not stand clear of
-its noise, they are those of a smoothed input (`without_noise`). A shift of a fraction of a sample averages two samples,
-and a filter changes what is fast: applied to the noise they would lower or raise the residuals, and the fit would
-choose lag and filter for that reason.
-Units: lag in samples of T here and in coordinates, in ms under its name; corners 1/(2πτ) in Hz.
+They act on the input of a curve, the position or the force of a creep test. Changes Δ that do not exceed the noise are
+taken from a smoothed input (`without_noise`). A shift by a fraction of a sample averages two samples, and a filter
+attenuates high frequencies: applied to the noise they would lower or raise the residuals, and bias the fitted lag and
+filter. Units: lag in samples of T here and in coordinates, in ms under its name; corners 1/(2πτ) in Hz.
 """
 
 from collections.abc import Sequence
@@ -45,15 +44,16 @@ _CLEAR = 5.0  # standard deviations of the noise in a difference
 
 
 def can_be_timed(tests: Sequence[Test]) -> bool:
-    """Whether an input changes clearly from one row to the next, so that a lag shows."""
+    """Whether the input of any test has a significant row-to-row change, so that a lag can be estimated."""
     return any(bool(clear_changes(test.input).any()) for test in tests if test.input is not None)
 
 
 def clear_changes(values: Float[np.ndarray, "R m"]) -> Bool[np.ndarray, " m"]:
-    """Rows at which the mean of the repeats changes by more than its noise from the row before, and their neighbours.
+    """Mask of the rows near which the mean of the repeats changes significantly from one row to the next.
 
-    The row before the first one is 0. An encoder at rest has no noise; when it moves, a change has that of two
-    roundings at most, which repeats may share. `values` (R, m), in any unit -> (m,).
+    The row before the first one counts as 0; the 3 rows on either side of a change are included. The noise of a change
+    is at least that of the quantisation step, since an encoder at rest shows no noise. `values` (R, m), any unit ->
+    (m,).
     """
     mean, step = values.mean(axis=0), step_of(values)
     noise = max(_noise_of_change(mean), 0.0 if step is None else step / 6**0.5)
@@ -62,35 +62,35 @@ def clear_changes(values: Float[np.ndarray, "R m"]) -> Bool[np.ndarray, " m"]:
 
 
 def without_noise(values: Float[np.ndarray, "R m"], clear: Bool[np.ndarray, " m"]) -> Float[np.ndarray, "R m"]:
-    """An input whose rows that do not change clearly are replaced by the line through such rows around them.
+    """Input with the rows outside `clear` replaced by the local line through such rows around them.
 
-    A fit lowers what noise of the input does to its residuals by too small a stiffness, and a shift of that noise by a
-    lag. `values` (R, m) of rows at even times, `clear` (m,) -> (R, m).
+    Noise of the input would bias the fitted stiffness towards 0, and shifting that noise would bias the lag. `values`
+    (R, m) of rows at even times, `clear` (m,): rows with a significant change -> (R, m).
     """
     return np.where(clear, values, local_line(values, ~clear))
 
 
 def is_position_clearer(test: Test) -> bool:
-    """Whether the changes of the position stand clearer of its noise than those of the force of theirs."""
+    """Whether the position has the higher ratio of largest change to noise than the force."""
     assert test.input is not None
     position, force = (test.input, test.output) if test.kind == "relaxation" else (test.output, test.input)
     return _clearness(position) > _clearness(force)
 
 
 def is_fitted_in_force(test: Test) -> bool:
-    """Whether a test is a creep test that is fitted in its force."""
+    """Whether a creep test is fitted with force as its output, because its force is the noisier channel."""
     return test.kind == "creep" and is_position_clearer(test)
 
 
 def _clearness(values: Float[np.ndarray, "R m"]) -> float:
-    """The largest change from row to row over the noise of one."""
+    """Ratio of the largest row-to-row change to the noise of such a change; inf without noise."""
     mean = values.mean(axis=0)
     noise = _noise_of_change(mean)
     return float(np.max(np.abs(np.diff(mean, prepend=0.0))) / noise) if noise > 0 else np.inf
 
 
 def _noise_of_change(mean: Float[np.ndarray, " m"]) -> float:
-    """Standard deviation of the noise in a change from row to row."""
+    """Standard deviation of the noise in a row-to-row change, from fourth differences."""
     # A fourth difference, which a smooth curve does not have, has the variance of 70 samples, a first one that of two.
     return float(1.4826 * np.median(np.abs(np.diff(mean, 4))) / np.sqrt(35))
 
@@ -98,9 +98,11 @@ def _noise_of_change(mean: Float[np.ndarray, " m"]) -> float:
 def multiplier(
     on_position: bool, lag: Float[Array, ""], tau: Float[Array, ""] | None, z: Complex[Array, " w"]
 ) -> Complex[Array, " w"]:
-    """What the changes are multiplied by and added to their channel: `lag` and time constant `tau` in samples.
+    """Transfer factor of the input's changes by which lag and filter of the force channel alter the input.
 
-    `z` (w,): points of the plane at which the transforms are known -> (w,), without unit. `tau` None: no filter.
+    `lag`, `tau`: lag and time constant in samples; `tau` None: no filter. `on_position`: the input is the position,
+    else the force. `z` (w,): points at which the transforms are evaluated -> (w,), dimensionless, to be multiplied by
+    the changes and added to the input.
     """
     if tau is None:
         return _shift(-lag if on_position else lag, z)
@@ -113,10 +115,10 @@ def multiplier(
 
 
 def _late_filter(lag: Float[Array, ""], tau: Float[Array, ""], z: Complex[Array, " w"]) -> Complex[Array, " w"]:
-    """The multiplier of a first-order filter (time constant `tau`, samples) and a delay by `lag` samples together.
+    """Multiplier of a first-order filter (time constant `tau`, samples) and a delay by `lag` samples combined.
 
-    Exact for a signal that is straight between its samples, also for a fractional lag: the delayed signal has its bends
-    between samples, so that a filter for signals straight between samples must not be applied after the delay.
+    Exact for a signal that is linear between samples, also for a fractional lag: the delayed signal has its kinks
+    between samples, so a filter for signals linear between samples must not be applied after the delay.
     """
     # At the largest lag the part is a whole sample, which the formula covers as well.
     whole = jnp.clip(jnp.floor(lag), -LARGEST_LAG, LARGEST_LAG - 1)
@@ -127,7 +129,7 @@ def _late_filter(lag: Float[Array, ""], tau: Float[Array, ""], z: Complex[Array,
 
 
 def _shift(s: Float[Array, ""], z: Complex[Array, " w"]) -> Complex[Array, " w"]:
-    """The multiplier of an advance by s samples, a straight line from each sample to the next."""
+    """Multiplier of an advance by s samples (delay for s < 0), with linear interpolation between samples."""
     total, later, earlier = jnp.zeros_like(z), z, jnp.ones_like(z)
     for k in range(LARGEST_LAG):
         ahead, behind = (jnp.clip(value, 0, 1).astype(z.dtype) for value in (s - k, -s - k))

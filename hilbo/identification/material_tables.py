@@ -1,12 +1,11 @@
 """Material tables: CSV or Parquet, one row per sample of a creep or relaxation test.
 
-Columns carry their unit: `time_s`, `time (ms)` and `time [s]` are the same to the reader. `test` is relaxation
-(position applied, force measured) or creep (force applied, position measured), with `time`, `position` and `force` in
-every row; `repeat` tells repetitions apart and `material` materials. A table of moduli has `time` and `modulus`
-(relaxation) or `compliance` (creep) instead, and needs no `test`. Other columns are ignored, and so are letters that
-stand for something else (`_quantities`).
-Everything is turned into s, mm, N, Pa (or N/mm) and 1/Pa (or mm/N). Whatever is wrong is one sentence with file and
-line.
+Column names include their unit: `time_s`, `time (ms)` and `time [s]` are accepted alike. `test` is relaxation (position
+applied, force measured) or creep (force applied, position measured), with `time`, `position` and `force` in every row;
+`repeat` identifies repeats and `material` materials. A table of moduli has `time` and `modulus` (relaxation) or
+`compliance` (creep) instead, and needs no `test`. Other columns are ignored, including one-letter names that denote
+another quantity (`_quantities`). Values are converted to s, mm, N, Pa (or N/mm) and 1/Pa (or mm/N). Invalid input
+raises `InputError` with file and line.
 """
 
 import os
@@ -32,7 +31,7 @@ _NAMES = {
     "modulus": ("modulus", "relaxation modulus", "g"),
     "compliance": ("compliance", "creep compliance", "j"),
 }
-_LETTERS = {"t", "x", "F", "G", "J"}  # as they are written for the quantities
+_LETTERS = {"t", "x", "F", "G", "J"}  # the usual symbols of the quantities
 _QUANTITY = {name: quantity for quantity, names in _NAMES.items() for name in names}
 # Factor to the first unit of each line.
 _UNITS = {
@@ -47,10 +46,10 @@ _HEAD = re.compile(r"\s*([A-Za-z][A-Za-z ]*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\)|[_ ]
 
 
 class Material(NamedTuple):
-    """What a table says of one material.
+    """Tests of one material, read from a table.
 
     `tests` in the order relaxation, creep, modulus, compliance; `stiffness_unit` of K: N/mm, or Pa for moduli in Pa;
-    `notes`: what was done to the data that a reader should know.
+    `notes`: how the data were changed, such as interpolation of repeats.
     """
 
     tests: tuple[Test, ...]
@@ -66,9 +65,10 @@ def read_material(
     only: str | None = None,
     longest: float | None = None,
 ) -> Material:
-    """The tests of one material, or `only` one kind of them, up to `longest` s.
+    """Read the tests of one material from a table.
 
-    `begin` says how they start (`fitting.Test`). Raises `InputError`.
+    `begin`: state before the first row, "rest" or "equilibrium" (`fitting.Test`); `only`: kind of test to read;
+    `longest`: read the rows up to this time (s). Raises `InputError`.
     """
     source = str(path)
     text = read_cells(path, "a material table needs a header with units and the samples of a test")
@@ -102,7 +102,7 @@ def read_material(
 
 
 class _Head(NamedTuple):
-    """A column that may hold a quantity: its name without the unit, and the unit."""
+    """Column header that may denote a quantity: column name, name without unit, quantity and unit."""
 
     column: str
     name: str
@@ -111,33 +111,36 @@ class _Head(NamedTuple):
 
     @property
     def short(self) -> bool:
-        """Whether the name is a letter, which may stand for something else."""
+        """Whether the name is a single letter, which may denote another quantity."""
         return len(self.name) == 1
 
     @property
     def usable(self) -> bool:
-        """Whether the unit is one of the quantity's."""
+        """Whether the unit is a known unit of the quantity."""
         return self.unit in _UNITS[self.quantity]
 
 
 def _columns(text, source):
-    """Which column holds each quantity, and in which unit."""
+    """Columns and units by quantity: two dicts.
+
+    Raises `InputError` for unknown units and missing or duplicate columns.
+    """
     columns, units = {}, {}
     for head in _quantities(text.columns):
         quantity, unit = head.quantity, head.unit
         if not head.usable:
             allowed = ", ".join(_UNITS[quantity])
-            says = f'has the unit "{unit}"' if unit else "has no unit"
+            unit_text = f'has the unit "{unit}"' if unit else "has no unit"
             example = f"{head.name} ({next(iter(_UNITS[quantity]))})"
             raise InputError(
-                f'{place(source)}column "{head.column}" {says}; write it like "{example}", with one of {allowed}.'
+                f'{place(source)}column "{head.column}" {unit_text}; write it like "{example}", with one of {allowed}.'
             )
         if quantity in columns:
             raise InputError(
                 f'{place(source)}columns "{columns[quantity]}" and "{head.column}" both are a {quantity}; keep one.'
             )
         columns[quantity], units[quantity] = head.column, unit
-    if not _whole(columns):
+    if not _is_complete(columns):
         raise InputError(
             f"{place(source)}a material table has time, position and force, or time and modulus or compliance, each"
             f" with its unit as in time_s; found {', '.join(columns) or 'none of them'}."
@@ -146,20 +149,21 @@ def _columns(text, source):
 
 
 def _quantities(columns: Iterable[str]) -> list[_Head]:
-    """The columns that hold quantities, without letters that stand for something else: T (degC), F_max, g.
+    """Headers of the columns that hold quantities.
 
-    A letter is not the quantity's where a column has the quantity's name and the letter is not written as above, or
-    where its unit is none of the quantity's and the table is whole without it.
+    One-letter names that denote another quantity, such as T (degC) or g, are left out: if another column has the
+    quantity's full name and the letter is not its usual symbol, or if its unit is not a unit of the quantity and the
+    table is complete without it.
     """
     heads = [head for column in columns if (head := _head(column)) is not None]
     named = {head.quantity for head in heads if not head.short}
     heads = [head for head in heads if not head.short or head.quantity not in named or head.name in _LETTERS]
     usable = {head.quantity for head in heads if head.usable}
-    return [head for head in heads if head.usable or not head.short or not _whole(usable)]
+    return [head for head in heads if head.usable or not head.short or not _is_complete(usable)]
 
 
 def _head(column: str) -> _Head | None:
-    """A column's name and unit; None for one that holds no quantity."""
+    """Parse a column name into quantity and unit; None if it names no quantity."""
     match = _HEAD.fullmatch(column)
     quantity = _QUANTITY.get(match[1].lower()) if match else None
     if match is None or quantity is None:
@@ -168,14 +172,14 @@ def _head(column: str) -> _Head | None:
     return _Head(column, match[1], quantity, unit.replace("µ", "u").replace("μ", "u"))
 
 
-def _whole(quantities: Collection[str]) -> bool:
-    """Whether these are a material table."""
+def _is_complete(quantities: Collection[str]) -> bool:
+    """Whether the quantities suffice for a material table: time with position and force, or time with moduli."""
     measured, derived = {"position", "force"} & set(quantities), {"modulus", "compliance"} & set(quantities)
     return "time" in quantities and (len(measured) == 2 or bool(derived and not measured))
 
 
 def _kinds(text, columns, source):
-    """The kind of test of each row."""
+    """Kind of test of each row. Raises `InputError` for a missing or unknown kind."""
     if "position" not in columns:
         both = {"modulus", "compliance"} <= set(columns)
         if both:
@@ -195,17 +199,17 @@ def _kinds(text, columns, source):
 
 
 def _test(kind, values, repeats, source, start, longest, notes):
-    """One kind of test, its repeats on common times."""
+    """One kind of test as a `Test`, with its repeats interpolated to common times; appends to `notes` if they were."""
     output = {"relaxation": "force", "creep": "position"}.get(kind, kind)
-    put = {"relaxation": "position", "creep": "force"}.get(kind)
+    applied = {"relaxation": "position", "creep": "force"}.get(kind)
     tables = [values[repeats == name] for name in repeats.unique()]
     for table in tables:
         falls = table["time"].diff() <= 0
         refuse(falls, source, lambda row: "time does not increase from the row before; sort the rows of each repeat.")
-    if put is None:
+    if applied is None:
         refuse(values["time"] <= 0, source, lambda row: "time is not above 0; moduli are counted from the step.")
         refuse(values[output] <= 0, source, lambda row: f"{output} is not above 0.")
-    first = [0.0 if put is None else table["time"].iloc[0] for table in tables]
+    first = [0.0 if applied is None else table["time"].iloc[0] for table in tables]
     times = [table["time"].to_numpy() - zero for table, zero in zip(tables, first, strict=True)]
     times, tables = _shortened(times, tables, longest, f"{source}: the {kind} test")
     time, resampled = _common(times)
@@ -214,24 +218,29 @@ def _test(kind, values, repeats, source, start, longest, notes):
     if resampled:
         last = max(t[-1] for t in times)
         cut = f", up to {time[-1]:g} s, where the shortest ends (the longest: {last:g} s)" if time[-1] < last else ""
-        how = "" if put else " in their logarithms"
+        how = "" if applied else " in their logarithms"
         notes.append(
             f"The repeats of the {kind} test have different times;"
             f" they were interpolated{how} to those of the first{cut}."
         )
-    columns = [output] + ([put] if put else [])
-    between = _interpolated_logs if resampled and put is None else np.interp
+    columns = [output] + ([applied] if applied else [])
+    between = _interpolated_logs if resampled and applied is None else np.interp
     stacked = {
         c: np.stack([between(time, t, p[c].to_numpy()) for t, p in zip(times, tables, strict=True)]) for c in columns
     }
     try:
-        return Test(kind, time, stacked[output], stacked.get(put) if put else None, "rest" if put is None else start)
+        return Test(
+            kind, time, stacked[output], stacked.get(applied) if applied else None, "rest" if applied is None else start
+        )
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
 
 
 def _shortened(times: list, tables: list, longest: float | None, which: str) -> tuple[list, list]:
-    """Times (s) of each repeat and its rows, up to `longest` s. Raises `InputError` where `which` test has none."""
+    """Rows of each repeat, and their times (s), up to `longest` s.
+
+    Raises `InputError`, naming the test as `which`, if a repeat has none.
+    """
     if longest is None:
         return times, tables
     latest = max(t[0] for t in times)
@@ -242,7 +251,7 @@ def _shortened(times: list, tables: list, longest: float | None, which: str) -> 
 
 
 def _common(times: list[Float[np.ndarray, " _"]]) -> tuple[Float[np.ndarray, " m"], bool]:
-    """Times that all repeats have, and whether interpolation is needed."""
+    """Times shared by all repeats, those of the first, and whether the other repeats must be interpolated."""
     first = times[0]
     if all(t.size == first.size and np.allclose(t, first, rtol=0, atol=1e-9 * first[-1]) for t in times):
         return first, False
@@ -251,10 +260,10 @@ def _common(times: list[Float[np.ndarray, " _"]]) -> tuple[Float[np.ndarray, " m
 
 
 def _interpolated_logs(
-    time: Float[np.ndarray, " m"], known: Float[np.ndarray, " _"], values: Float[np.ndarray, " _"]
+    time: Float[np.ndarray, " m"], known_time: Float[np.ndarray, " _"], values: Float[np.ndarray, " _"]
 ) -> Float[np.ndarray, " m"]:
-    """`values` at `known` times, at other times: moduli are nearer to straight lines in their logarithms. All above 0.
+    """Interpolate positive `values`, given at `known_time`, to `time`; linearly in log-log, where moduli are smooth.
 
     `time` (m,) -> (m,), in the unit of the values.
     """
-    return np.exp(np.interp(np.log(time), np.log(known), np.log(values)))
+    return np.exp(np.interp(np.log(time), np.log(known_time), np.log(values)))

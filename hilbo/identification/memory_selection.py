@@ -1,7 +1,7 @@
-"""How much memory a rendering needs: the same tests fitted anew with every number of taps, and with full memory.
+"""Choice of the memory length: the same tests are fitted with each number of taps, and with full memory.
 
-Parameters belong to their N: each row has its own. The paper takes the smallest N whose error is below 4 % on both
-tests; its own errors at N = 101 are 3.92 % (creep with recovery) and 0.32 % (relaxation).
+Parameters depend on N, so each row has its own. The paper takes the smallest N whose error is below 4 % on both tests;
+its own errors at N = 101 are 3.92 % (creep with recovery) and 0.32 % (relaxation).
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ PAPER = {"creep": 0.0392, "relaxation": 0.0032}
 
 
 class Row(NamedTuple):
-    """The fit with one memory: `N` taps, or full memory where N is None."""
+    """Fit with one memory length: `N` taps, or full memory if N is None; `nrmse` by kind of test."""
 
     N: int | None
     fit: Fit
@@ -36,7 +36,10 @@ def select_memory(
     lag: float = 0.0,
     corner: float = np.inf,
 ) -> tuple[Row, ...]:
-    """Fit the tests with each memory; `lag` (s) and `corner` (Hz) of the force channel are those of `sampled`."""
+    """Fit the tests with each memory length in `choices`.
+
+    `lag` (s) and `corner` (Hz) of the force channel stay fixed.
+    """
     if not choices:
         raise InputError("There is no number of taps to choose from.")
     rows = []
@@ -49,6 +52,6 @@ def select_memory(
 
 
 def smallest(rows: Sequence[Row], limit: float = LIMIT) -> Row | None:
-    """The row with the fewest taps whose errors are all below the limit; None if there is none (but full memory)."""
+    """Row with the fewest taps (not full memory) whose NRMSE is below `limit` for every test; None if there is none."""
     good = [row for row in rows if row.N is not None and max(row.nrmse.values()) < limit]
     return min(good, key=lambda row: row.N or np.inf, default=None)

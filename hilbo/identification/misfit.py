@@ -1,8 +1,8 @@
-"""Signs of the instrument in the residuals of a fit: a filter in the force channel, an input between the rows.
+"""Diagnostics of a fit without refitting: a filter in the force channel, and the shape of the input between rows.
 
-Each question is one direction v in which the residuals r would change if the answer were yes. Less what the free
-coordinates can make of it, v' = v - J A⁻¹ Jᵀ v, the score v'ᵀr has the variance v'ᵀ Γ v' under the noise of the fit,
-and J A⁻¹ Jᵀ v moves the coordinates by A⁻¹ Jᵀ v. No further fit is needed (Rao 1948).
+Each alternative defines a direction v in which the residuals r would change. After projection off the free coordinates,
+v' = v - J A⁻¹ Jᵀ v, the score v'ᵀr has the variance v'ᵀ Γ v' under the noise of the fit, and the coordinates would move
+by A⁻¹ Jᵀ v (score test, Rao 1948).
 """
 
 from collections.abc import Sequence
@@ -15,17 +15,20 @@ from jaxtyping import Array, Float
 
 from hilbo.identification.fitting import Curve, Fit, Test, curve_residuals
 from hilbo.identification.intervals import inverse_of_free
-from hilbo.identification.residual_noise import filtered, fitted_residuals, noises
+from hilbo.identification.residual_noise import fitted_residuals, noises, weighted_normal
 from hilbo.identification.sampled import Sampled
 from hilbo.numerics.tracing import program
 
-__all__ = ["filter_score", "is_coarse", "moved_between_rows"]
+__all__ = ["coarse_kinds", "filter_score", "moved_between_rows"]
 
-_TIMES = (0.3, 0.8, 2.0)  # time constants that are tried, samples
+_TIMES = (0.3, 0.8, 2.0)  # time constants tested, samples
 
 
 def filter_score(fitted: Fit) -> float:
-    """How many standard deviations the residuals speak for a filter of the force; the largest of three filters."""
+    """Score statistic (in standard deviations) for a first-order filter of the force.
+
+    Largest of three time constants.
+    """
     model = fitted.model
     corners = jnp.asarray([1 / (2 * np.pi * tau * model.T) for tau in _TIMES])
     return float(jnp.max(_filter_scores(fitted, corners)))
@@ -33,7 +36,7 @@ def filter_score(fitted: Fit) -> float:
 
 @program
 def _filter_scores(fit: Fit, corners: Float[Array, " f"]) -> Float[Array, " f"]:
-    """The score of each corner (Hz), positive where the filter lowers the cost."""
+    """Score statistic of each corner frequency (Hz); positive if the filter lowers the cost."""
     before = fitted_residuals(fit, fit.q)
     slopes = jax.jacfwd(lambda x: fitted_residuals(fit, x))(fit.q)
     models = noises(fit)
@@ -43,28 +46,26 @@ def _filter_scores(fit: Fit, corners: Float[Array, " f"]) -> Float[Array, " f"]:
         filtering = eqx.tree_at(lambda m: m.corner, fit.model, corner)
         after = [curve_residuals(filtering, c, w, fit.q) for c, w in zip(fit.curves, fit.weights, strict=True)]
         change = [a - b for a, b in zip(after, before, strict=True)]
-        made = inverse @ sum(J.T @ v for J, v in zip(slopes, change, strict=True))
-        left = [v - J @ made for J, v in zip(slopes, change, strict=True)]
+        explained = inverse @ sum(J.T @ v for J, v in zip(slopes, change, strict=True))
+        projected = [v - J @ explained for J, v in zip(slopes, change, strict=True)]
         variance = sum(
-            r @ r / r.size * filtered(v[:, None], n)[0, 0] for r, v, n in zip(before, left, models, strict=True)
+            r @ r / r.size * weighted_normal(v[:, None], n)[0, 0]
+            for r, v, n in zip(before, projected, models, strict=True)
         )
-        return -sum(v @ r for v, r in zip(left, before, strict=True)) / jnp.sqrt(variance)
+        return -sum(v @ r for v, r in zip(projected, before, strict=True)) / jnp.sqrt(variance)
 
     return jax.lax.map(score, corners)
 
 
 def moved_between_rows(fitted: Fit, tests: Sequence[Test]) -> Float[np.ndarray, " p"]:
-    """How far the coordinates move if the input is a smooth curve between the rows in place of straight lines. (p,).
-
-    The smooth curve is the monotone cubic of Fritsch and Carlson.
-    """
+    """Change of the coordinates if the input between rows is a monotone (Fritsch-Carlson) cubic, not linear. (p,)."""
     smooth = tuple(fitted.model.prepare(test, smooth=True) for test in tests)
     return np.asarray(_moved(fitted, smooth))
 
 
 @program
 def _moved(fit: Fit, others: tuple[Curve, ...]) -> Float[Array, " p"]:
-    """A⁻¹ Jᵀ v for what other curves change of the residuals."""
+    """First-order change of the coordinates when each curve is replaced by its counterpart in `others`."""
     slopes = jax.jacfwd(lambda x: fitted_residuals(fit, x))(fit.q)
     pulls = jnp.zeros_like(fit.q)
     for curve, other, w, J in zip(fit.curves, others, fit.weights, slopes, strict=True):
@@ -73,8 +74,8 @@ def _moved(fit: Fit, others: tuple[Curve, ...]) -> Float[Array, " p"]:
     return -inverse_of_free(fit) @ pulls
 
 
-def is_coarse(model: object, tests: Sequence[Test]) -> list[str]:
-    """Kinds of the tests whose rows are further apart than the sampling time of the model."""
+def coarse_kinds(model: object, tests: Sequence[Test]) -> list[str]:
+    """Kinds of the tests whose median time step exceeds the sampling time T of the model; empty for moduli."""
     if not isinstance(model, Sampled):
         return []
     return [test.kind for test in tests if np.median(np.diff(test.time)) > 1.001 * model.T]

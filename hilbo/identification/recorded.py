@@ -1,4 +1,4 @@
-"""Recorded tests as numbers: their force and position, lines through and between their rows, lengths of transforms."""
+"""Helpers for recorded tests: force and position, local lines, interpolation between rows, and FFT lengths."""
 
 from typing import Any
 
@@ -9,8 +9,8 @@ from hilbo.identification.fitting import Test
 
 __all__ = [
     "AROUND",
-    "between",
-    "circle",
+    "damping_radius",
+    "interpolated",
     "local_line",
     "position_driven",
     "secant",
@@ -18,13 +18,13 @@ __all__ = [
     "unit_of_force",
 ]
 
-AROUND = 3  # rows before and after one that belong to it
+AROUND = 3  # half-width (rows) of the local line
 
 
 def local_line(values: Float[np.ndarray, "R m"], chosen: Bool[np.ndarray, " m"]) -> Float[np.ndarray, "R m"]:
-    """Each row's place on the line through the chosen rows among it and three on both sides.
+    """Smooth each row by a line fitted to the `chosen` rows among it and the three rows on either side.
 
-    Where fewer than two are chosen, the row itself. `values` (R, m) at even times, `chosen` (m,) -> (R, m).
+    Where fewer than two of these are chosen, the value itself. `values` (R, m) at even times, `chosen` (m,) -> (R, m).
     """
     offsets = np.arange(-AROUND, AROUND + 1.0)
     among = chosen.astype(values.dtype)
@@ -33,26 +33,29 @@ def local_line(values: Float[np.ndarray, "R m"], chosen: Bool[np.ndarray, " m"])
         return np.convolve(row, (offsets**power)[::-1], "same")
 
     count, first, second = (moment(among, power) for power in range(3))
-    size = count * second - first**2
+    determinant = count * second - first**2
     line = np.stack([second * moment(among * row, 0) - first * moment(among * row, 1) for row in values])
-    return np.where(size > 0.5, line / np.maximum(size, 0.5), values)
+    return np.where(determinant > 0.5, line / np.maximum(determinant, 0.5), values)
 
 
 def _force_and_position(test: Test) -> tuple[Any, Any]:
-    """Both (R, m), whichever was applied."""
+    """Force and position of a test, (R, m) each, whichever was applied."""
     return (test.output, test.input) if test.kind == "relaxation" else (test.input, test.output)
 
 
 def position_driven(test: Test) -> Test:
-    """The test with force as its output."""
+    """The test with position as its input and force as its output."""
     force, position = _force_and_position(test)
     return Test("relaxation", test.time, force, position, test.start)
 
 
-def between(
+def interpolated(
     grid: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], rows: Float[np.ndarray, "R m"], smooth: bool
 ) -> Float[np.ndarray, "R n"]:
-    """The rows at the times of the grid; after the last row they stay."""
+    """Interpolate `rows`, sampled at `time`, to the times of `grid`: linearly, or by a `smooth` monotone cubic.
+
+    Beyond the last row the values stay constant. -> (R, n).
+    """
     if not smooth:
         return np.stack([np.interp(grid, time, row) for row in rows])
     from scipy.interpolate import PchipInterpolator
@@ -61,24 +64,24 @@ def between(
 
 
 def unit_of_force(test: Test) -> float:
-    """Factor from the scale of the output to one of force: for positions the mean stiffness, N/mm."""
+    """Factor that converts a scale of the output to one of force: mean stiffness (N/mm) for creep, 1 for relaxation."""
     force, position = _force_and_position(test)
     return float(np.mean(np.abs(force)) / np.mean(np.abs(position))) if test.kind == "creep" else 1.0
 
 
 def secant(test: Test) -> float:
-    """Largest force over largest position, N/mm."""
+    """Secant stiffness: largest force / largest position, N/mm."""
     force, position = _force_and_position(test)
     return float(np.max(np.abs(force)) / np.max(np.abs(position)))
 
 
 def transform_length(count: int) -> int:
-    """A length that transforms fast, at least three times as long as the data."""
+    """FFT length for `count` samples: at least three times as long, and fast to transform."""
     from scipy.fft import next_fast_len
 
     return 2 * next_fast_len((3 * count + 1) // 2)
 
 
-def circle(length: int, dtype: Any) -> float:
-    """Radius of the circle on which `length` points damp what wraps around to eps^0.8."""
+def damping_radius(length: int, dtype: Any) -> float:
+    """Radius of the circle for `length`-point damped FFTs that reduces wrap-around to eps^0.8."""
     return float(np.finfo(dtype).eps ** (-0.8 / length))

@@ -1,13 +1,13 @@
-"""Rounding of a recorded channel, as by an encoder, and what it adds to the variance of the estimates.
+"""Quantisation error of a recorded channel, as by an encoder, and its contribution to the variance of the estimates.
 
 The error of rounding to a step s, where the rounded value has moved by d between two rows, has the covariance
 
     s²/2·B₂({d/s}) = Σ_h s²/(2π²h²)·cos(2πh·d/s),      B₂(f) = f² - f + 1/6,
 
-over the unknown place of the channel within its step (Widrow & Kollár 2008, Quantization Noise, chapter 9). A held
-position has one error for the whole record, and so has a ramp that moves by a multiple of the step from row to row:
-neither leaves residuals that tell of it. White noise σ before the rounding multiplies term h by exp(-4π²h²σ²/s²):
-above half a step of noise nothing is left but white noise, which the residuals show.
+if the position within the step is uniformly distributed (Widrow & Kollár 2008, Quantization Noise, chapter 9). A
+constant position has one error for the whole record, and so has a ramp that moves by a multiple of the step per row:
+neither is visible in the residuals. White noise σ before the rounding multiplies term h by exp(-4π²h²σ²/s²): for more
+than half a step of noise only white noise remains, which the residuals show.
 """
 
 from typing import Any
@@ -19,43 +19,49 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hilbo.identification.fitting import Curve
-from hilbo.identification.recorded import circle, local_line
+from hilbo.identification.recorded import damping_radius, local_line
 
 __all__ = ["Rounding", "rounding", "step_of", "variance_of_rounding"]
 
 _HARMONICS = 4
-_SMALLEST, _LARGEST = 1e-7, 5e-3  # step, over the range: less is the arithmetic's, more the programmed input's
-_SIZES = 3  # of changes from row to row, which a recording has
-_NEGLIGIBLE = 1e-3  # share of the first harmonic that noise leaves
+_SMALLEST, _LARGEST = 1e-7, 5e-3  # step / range: smaller is float rounding, larger a programmed input
+_SIZES = 3  # distinct row-to-row changes, which a recording has at least
+_NEGLIGIBLE = 1e-3  # amplitude of the first harmonic after noise
 
 
 class Rounding(eqx.Module):
-    """`turns` (R, m): the smoothed channel over its step; `sizes` (H,): standard deviations of the harmonics."""
+    """Quantisation of one channel.
+
+    `turns` (R, m): smoothed channel / step; `sizes` (H,): standard deviations of the harmonics.
+    """
 
     turns: Float[Array, "R m"]
     sizes: Float[Array, " H"]
 
 
 def rounding(values: Float[np.ndarray, "R m"], still: Bool[np.ndarray, " m"]) -> Rounding | None:
-    """That of a channel at even times, None where noise covers it. `still` (m,): rows that do not move clearly."""
+    """Quantisation of a channel with evenly timed rows; None if there is none or noise hides it.
+
+    `still` (m,): rows without a significant change.
+    """
     step = step_of(values)
     if step is None:
         return None
     # A fourth difference, which a smooth curve does not have, has the variance of 70 samples.
-    among = np.convolve(still, np.ones(5), "valid") == 5
-    noise = np.square(np.diff(values, 4, axis=1)[:, among]).mean() / 70 - step**2 / 12 if among.any() else 0.0
+    flat = np.convolve(still, np.ones(5), "valid") == 5
+    noise = np.square(np.diff(values, 4, axis=1)[:, flat]).mean() / 70 - step**2 / 12 if flat.any() else 0.0
     h = np.arange(1, _HARMONICS + 1)
-    left = np.exp(-4 * np.pi**2 * h**2 * max(noise, 0.0) / step**2)
-    if left[0] < _NEGLIGIBLE:
+    attenuation = np.exp(-4 * np.pi**2 * h**2 * max(noise, 0.0) / step**2)
+    if attenuation[0] < _NEGLIGIBLE:
         return None
     turns = local_line(values, np.ones(values.shape[1], bool)) / step
-    return Rounding(jnp.asarray(turns), jnp.asarray(step / (np.pi * h) * np.sqrt(left / 2)))
+    return Rounding(jnp.asarray(turns), jnp.asarray(step / (np.pi * h) * np.sqrt(attenuation / 2)))
 
 
 def step_of(values: Float[np.ndarray, "R m"]) -> float | None:
-    """The smallest difference of distinct values, None where that is no step of a recording.
+    """Quantisation step of a recorded channel (smallest difference of distinct values); None if it is not quantised.
 
-    An input as it was programmed has few values too, but changes by one size from row to row.
+    A programmed input has few distinct values too, but changes by few sizes from row to row.
     """
     distinct = np.diff(np.unique(values))
     distinct = distinct[distinct > _SMALLEST * np.ptp(values)]
@@ -69,12 +75,15 @@ def step_of(values: Float[np.ndarray, "R m"]) -> float | None:
 def variance_of_rounding(
     model: Any, q: Float[Array, " p"], curve: Curve, weights: Float[Array, " R"], slopes: Float[Array, "m p"]
 ) -> Float[Array, "p p"]:
-    """Variance of Jᵀ r by the rounding of both channels of a curve, at its fit. `slopes` J (m, p)."""
+    """Variance of Jᵀ r (p, p) due to the quantisation of both channels of a curve, at coordinates q.
+
+    `slopes` J (m, p).
+    """
     total = jnp.zeros((q.size, q.size), q.dtype)
     to_residuals = slopes / (curve.scale * np.sqrt(curve.time.size))[:, None]
 
     def of_input(waves):
-        damping = circle(curve.length, q.dtype) ** -jnp.arange(waves.shape[1], dtype=q.dtype)
+        damping = damping_radius(curve.length, q.dtype) ** -jnp.arange(waves.shape[1], dtype=q.dtype)
         spectra = jnp.fft.rfft(waves * damping[None, :], curve.length)
         alone = eqx.tree_at(
             lambda c: (c.spectra, c.changes, c.offset), curve, (spectra, jnp.zeros_like(spectra), jnp.zeros(2, q.dtype))
@@ -83,12 +92,14 @@ def variance_of_rounding(
 
     for errors, response in ((curve.rounded_input, of_input), (curve.rounded_output, lambda waves: waves)):
         if errors is not None:
-            total = total + _summed(errors, weights, response, to_residuals)
+            total = total + _summed_variance(errors, weights, response, to_residuals)
     return total
 
 
-def _summed(errors: Rounding, weights: Float[Array, " R"], response: Any, to_residuals: Float[Array, "m p"]) -> Any:
-    """Over repeats and harmonics."""
+def _summed_variance(
+    errors: Rounding, weights: Float[Array, " R"], response: Any, to_residuals: Float[Array, "m p"]
+) -> Any:
+    """Sum the variance over repeats and harmonics; `response` maps quantisation errors to the output."""
 
     order = jnp.arange(1, errors.sizes.size + 1, dtype=errors.sizes.dtype)
 

@@ -1,14 +1,14 @@
-"""The FO-SLS as it is rendered, as a model to be fitted to recorded tests.
+"""Discrete-time FO-SLS, as it is rendered, as a model for fitting recorded tests.
 
-Coordinates (the physics of three parts, each in its own time range, so that the column-scaled Jacobian has a condition
-number of about 30 instead of 30,000):
+Coordinates (three parts with separate time scales, so that the column-scaled Jacobian has a condition number of about
+30 instead of 30,000):
 
     q = (K_inst, K_eff, log κ, logit α),  K_inst = K0 + K1/(1 + κ) = H(∞),  K_eff = H(1),  κ = K1·T^α/B1
     H(z) = K_eff + (K_inst - K_eff)·(1 + κ)·(C(z) - S) / ((1 - S)·(κ + C(z))),  S = C(1)
 
 with C(z) = Σ_{i=0..N} c_i z^{-i} (`memory`), or (1 - 1/z)^α with full memory, where S = 0. A response is the inverse
-transform of H(z)·X(z) (of X(z)/H(z) for creep) on a circle |z| = r > 1: two FFTs whatever N is. The circle damps what
-wraps around by r^{-L} = eps^0.8, so the curves are those of the recursion to about eps^0.75.
+transform of H(z)·X(z) (of X(z)/H(z) for creep) on a circle |z| = r > 1: two FFTs for any N. The circle damps
+wrap-around by r^{-L} = eps^0.8, so the curves agree with the recursion to about eps^0.75.
 
 Units: N, mm, s; B1 N·s^α/mm.
 """
@@ -25,32 +25,41 @@ from jaxtyping import Array, Complex, Float, Int
 from hilbo.errors import InputError
 from hilbo.identification import instrument
 from hilbo.identification.fitting import MEASURED, Curve, Test
-from hilbo.identification.recorded import between, circle, position_driven, secant, transform_length, unit_of_force
+from hilbo.identification.recorded import (
+    damping_radius,
+    interpolated,
+    position_driven,
+    secant,
+    transform_length,
+    unit_of_force,
+)
 from hilbo.identification.rounding import rounding
 from hilbo.identification.screening import screened, separate
 
 __all__ = ["Sampled"]
 
 _TAPS = 1024
-_ROUNDING = 1e-9  # of a bound: a fit that ends there may lie beyond it once it is in s and Hz
-_MOST = 2_000_000  # samples of a test; a fit takes 1.3 kB for each, its intervals more
+_ROUNDING = 1e-9  # relative tolerance of a bound after conversion to s and Hz
+_MOST = 2_000_000  # samples of a test; a fit takes 1.3 kB of memory for each, its intervals more
 _LOG_KAPPA = np.log(10.0) * np.arange(-5.0, 3.1, 0.5)
 _LOGIT_ALPHA = np.array([-3.5, -2.2, -1.4, -0.6, 0.0, 0.6, 1.4, 2.2, 3.5, 4.4])
 
 
 class Sampled(eqx.Module):
-    """The FO-SLS as it is rendered: sampled every `T` s, with the last `N` samples or full memory.
+    """FO-SLS sampled every `T` s, with short memory of `N` past samples or full memory.
 
-    Full memory is the infinite sum, which `viscoelastic`'s sum of exponentials meets to 1e-4 of the largest force.
-    `lag` (s): how late the recorded force is against the position, negative where the position is late; `corner` (Hz)
-    of a first-order low-pass filter in the force channel (`instrument`). Each is a number or "fit", which appends a
-    coordinate: the lag in samples, the logarithm of the corner over 1/(2πT). No filter is a corner of infinity.
+    Full memory is the infinite sum, which `viscoelastic`'s sum of exponentials approximates to 1e-4 of the largest
+    force. `lag` (s): delay of the recorded force relative to the position, negative where the position is late;
+    `corner` (Hz) of a first-order low-pass filter in the force channel (`instrument`), inf for no filter. Each is a
+    number or "fit", which appends a coordinate: the lag in samples, the logarithm of the corner over 1/(2πT).
     """
 
     N: int | Int[Array, ""] = 101
     T: float = eqx.field(static=True, default=1e-3)
     memory: Literal["short", "full"] = eqx.field(static=True, default="short")
-    capacity: int = eqx.field(static=True, default=0)  # taps that are computed; models with one capacity compile once
+    capacity: int = eqx.field(
+        static=True, default=0
+    )  # number of taps computed; models of equal capacity share one compilation
 
     lag: Any = 0.0  # a number, an array of `at`, or "fit"
     corner: Any = np.inf
@@ -77,22 +86,21 @@ class Sampled(eqx.Module):
         return ("K_inst", "K_eff", "kappa", "alpha", *fitted)
 
     def physical(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-        """K_eff >= 0 is a limit of nature, and so is a filter too fast to matter."""
+        """Masks of the bounds that are physical limits: the lower bound K_eff = 0, and the highest filter corner."""
         upper = tuple(name == "corner" for name in self.labels)
         return tuple(name == "K_eff" for name in self.labels), upper
 
     def _corners(self) -> tuple[float, float]:
-        """Lowest and highest corner that is told from none, Hz."""
+        """Lowest and highest corner frequency (Hz) that can be fitted."""
         slowest, fastest = instrument.SLOWEST_FILTER * self.T, instrument.FASTEST_FILTER * self.T
         return 1 / (2 * np.pi * slowest), 1 / (2 * np.pi * fastest)
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of q: stiffness up to 50 times the largest secant, κ up to 1e4, α from 0.01 to 0.99.
 
-        κ goes down to 1e-4, or 1e-6 with full memory. Far below S(α) the curve no longer depends on it, and K1 would
-        grow as 1/κ for ever.
-        A fitted lag is up to two samples either way, a fitted filter's time constant from a twentieth of a sample to
-        five. Two arrays (p,).
+        κ has the lower bound 1e-4, or 1e-6 with full memory: far below S(α) the curve no longer depends on it, and K1
+        would grow as 1/κ without limit. A fitted lag is within two samples either way, a fitted filter's time constant
+        from a twentieth of a sample to five. Two arrays (p,).
         """
         top = max(secant(test) for test in tests)
         ends = np.log(0.99 / 0.01)
@@ -102,13 +110,13 @@ class Sampled(eqx.Module):
         return lower, np.array([50 * top, 50 * top, np.log(1e4), ends, *self._of_fitted(lag, -np.log(fast))])
 
     def _of_fitted(self, lag: float, corner: float) -> list[float]:
-        """Those of two numbers that belong to a fitted coordinate."""
+        """The given `lag` and `corner` values that are fitted coordinates of this model, in order."""
         return [value for value, own in ((lag, self.lag), (corner, self.corner)) if _is_fitted(own)]
 
     def starts(self, tests: Sequence[Test]) -> Float[np.ndarray, "starts p"]:
-        """The five best separate places of a grid in (κ, α).
+        """Five starting points: the best non-adjacent points of a grid in (κ, α). (5, p).
 
-        Read from position to force, every test is linear in K_inst and K_eff, which are solved for at each place.
+        With position as input every test is linear in K_inst and K_eff, which are solved for at each grid point.
         """
         curves = tuple(self.prepare(position_driven(test)) for test in tests)
         lower, upper = self.box(tests)
@@ -116,40 +124,40 @@ class Sampled(eqx.Module):
         grid = jnp.asarray(np.stack(np.meshgrid(_LOG_KAPPA, _LOGIT_ALPHA, indexing="ij"), axis=-1))
         plain = eqx.tree_at(lambda m: (m.lag, m.corner), self, (0.0, np.inf))
         costs, stiffness = (np.asarray(values) for values in screened(plain, curves, scales, grid))
-        rest = self._of_fitted(0.0, 0.0)
-        places = [np.concatenate([stiffness[index], np.asarray(grid[index]), rest]) for index in separate(costs, 5)]
-        return np.clip(np.stack(places), lower, upper)
+        appended = self._of_fitted(0.0, 0.0)
+        points = [np.concatenate([stiffness[index], np.asarray(grid[index]), appended]) for index in separate(costs, 5)]
+        return np.clip(np.stack(points), lower, upper)
 
     def prepare(self, test: Test, *, smooth: bool = False) -> Curve:
-        """Inputs on the grid of the model, transformed; between rows by straight lines, or a `smooth` monotone cubic.
+        """Convert a test to a `Curve`: interpolate the inputs to the model's samples and transform them.
 
-        A creep test whose noise is in the force is fitted the other way round (`Curve.fitted`): noise of an input
-        passes through the model, and a fit would lower it by a stiffness above the true one.
-        Raises `InputError` for a test of more samples than memory has room for.
+        Between rows the input is linear, or a `smooth` monotone cubic. A creep test with the noise in its force is
+        fitted with input and output exchanged (`Curve.fitted`): noise of the input passes through the model, and would
+        bias the fitted stiffness upwards. Raises `InputError` for a test with too many samples for the memory.
         """
         assert test.input is not None
         elapsed = test.time - test.time[0]
         self._check_length(test.kind, float(elapsed[-1]))
-        place = elapsed / self.T
-        near = np.round(place)
-        place = np.where(np.abs(place - near) < 1e-6, near, place)
-        count = int(np.ceil(place[-1])) + 1
+        position = elapsed / self.T
+        nearest = np.round(position)
+        position = np.where(np.abs(position - nearest) < 1e-6, nearest, position)
+        count = int(np.ceil(position[-1])) + 1
         grid = np.arange(count) * self.T
         offset = test.input[:, 0] if test.start == "equilibrium" else np.zeros(test.repeats)
         clear = instrument.clear_changes(test.input - offset[:, None])
-        even = np.ptp(np.diff(place)) < 1e-6
+        even = np.ptp(np.diff(position)) < 1e-6
         rows = instrument.without_noise(test.input, clear) if even else test.input
-        inputs = between(grid, elapsed, rows, smooth) - offset[:, None]
+        inputs = interpolated(grid, elapsed, rows, smooth) - offset[:, None]
         length = transform_length(count)
-        damping = circle(length, inputs.dtype) ** -np.arange(count + instrument.LARGEST_LAG, dtype=inputs.dtype)
+        damping = damping_radius(length, inputs.dtype) ** -np.arange(count + instrument.LARGEST_LAG, dtype=inputs.dtype)
         changes = np.diff(inputs, axis=1, prepend=0.0)
         if not even:
-            ends = np.minimum(np.searchsorted(place, np.arange(count)), place.size - 1)  # of each tick's line
+            ends = np.minimum(np.searchsorted(position, np.arange(count)), position.size - 1)  # of each tick's line
             changes = changes * clear[ends]
         # Where the position is late, the last forces depend on later input, which is extrapolated linearly.
         changes = np.pad(changes, ((0, 0), (0, instrument.LARGEST_LAG)), mode="edge")
-        before = np.minimum(place.astype(int), count - 2)
-        regular = bool(place.size == count and np.all(place == np.arange(count)))
+        before = np.minimum(position.astype(int), count - 2)
+        regular = bool(position.size == count and np.all(position == np.arange(count)))
         return Curve(
             test.kind,
             jnp.asarray(elapsed),
@@ -158,7 +166,7 @@ class Sampled(eqx.Module):
             jnp.asarray(np.full(test.time.size, np.ptp(test.output.mean(axis=0)))),
             jnp.asarray(np.fft.rfft(inputs * damping[:count], length)),
             jnp.asarray(before),
-            jnp.asarray(place - before),
+            jnp.asarray(position - before),
             length,
             jnp.asarray(np.fft.rfft(changes * damping, length)),
             regular,
@@ -168,7 +176,7 @@ class Sampled(eqx.Module):
         )
 
     def _check_length(self, kind: str, seconds: float):
-        """Refuse a test that lasts too long for its T."""
+        """Raise `InputError` for a test of more than 2,000,000 samples of T."""
         if seconds > _MOST * self.T:
             raise InputError(
                 f"The {kind} test lasts {seconds:g} s, which is {seconds / self.T:,.0f} samples of T = {self.T:g} s,"
@@ -177,20 +185,20 @@ class Sampled(eqx.Module):
             )
 
     def predict(self, q: Float[Array, " p"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
-        """The response to the weighted mean of the inputs, at the measured times.
+        """Response to the weighted mean of the inputs, at the measured times.
 
         `q` (p,), `weights` (R,) -> (m,), in mm or N.
         """
         assert curve.spectra is not None and curve.share is not None and curve.before is not None
-        H = self._transfer(q, curve.length, circle(curve.length, q.dtype))
+        H = self._transfer(q, curve.length, damping_radius(curve.length, q.dtype))
         creep = curve.kind == "creep"
         weighted = weights.astype(curve.spectra.dtype)
         spectrum = weighted @ curve.spectra
         if self._has_instrument():
             assert curve.changes is not None
-            spectrum = spectrum + self._added(q, curve) * (weighted @ curve.changes)
+            spectrum = spectrum + self._instrument_multiplier(q, curve) * (weighted @ curve.changes)
         spectrum = spectrum / H if creep else spectrum * H
-        growth = circle(curve.length, q.dtype) ** jnp.arange(curve.length // 2, dtype=q.dtype)
+        growth = damping_radius(curve.length, q.dtype) ** jnp.arange(curve.length // 2, dtype=q.dtype)
         response = jnp.fft.irfft(spectrum, curve.length)[: curve.length // 2] * growth
         rest = weights @ curve.offset
         rest = rest / q[1] if creep else rest * q[1]
@@ -199,12 +207,12 @@ class Sampled(eqx.Module):
     def as_input_noise(
         self, q: Float[Array, " p"], curve: Curve, r: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Float[Array, " m+1"], Float[Array, ""]]:
-        """Residuals r (m,) of a regular curve as noise of its recorded input, which the model then passed on.
+        """Express the residuals r (m,) of a regular curve as noise of its recorded input that passed through the model.
 
-        The noise (m,), over the scale of r; the factor by which the model multiplies its spectral density at πj/m,
-        j = 0 … m; and how many times larger the noise is than what comes of it in the same sample.
+        Returns the input noise (m,), in the scale of r; the factor (m + 1,) by which the model multiplies its spectral
+        density at πj/m, j = 0 … m; and the ratio of the input noise to the output it causes in the same sample.
         """
-        creep, radius, m = curve.kind == "creep", circle(curve.length, q.dtype), r.size
+        creep, radius, m = curve.kind == "creep", damping_radius(curve.length, q.dtype), r.size
         H = self._transfer(q, curve.length, radius)
         growth = radius ** jnp.arange(m, dtype=q.dtype)
         spectrum = jnp.fft.rfft(r / growth, curve.length)
@@ -213,23 +221,23 @@ class Sampled(eqx.Module):
         return source, (1 / gain if creep else gain), (q[0] if creep else 1 / q[0])
 
     def _has_instrument(self) -> bool:
-        """Whether the force channel is anything but a perfect one."""
+        """Whether the force channel has a lag or a filter, given or fitted."""
         return not (isinstance(self.lag, float) and self.lag == 0 and self._without_filter())
 
     def _without_filter(self) -> bool:
-        """Whether no filter is stated, nor fitted."""
+        """Whether the filter is neither given nor fitted."""
         return isinstance(self.corner, float) and bool(np.isinf(self.corner))
 
-    def _added(self, q: Float[Array, " p"], curve: Curve) -> Complex[Array, " {curve.length//2+1}"]:
-        """What the changes are multiplied by, at the upper half of the circle."""
+    def _instrument_multiplier(self, q: Float[Array, " p"], curve: Curve) -> Complex[Array, " {curve.length//2+1}"]:
+        """Multiplier of the input's changes for lag and filter (`instrument`), at the upper half of the circle."""
         lag = q[4] if _is_fitted(self.lag) else jnp.asarray(self.lag, q.dtype) / self.T
         corner = jnp.exp(q[-1]) if _is_fitted(self.corner) else jnp.asarray(2 * np.pi * self.T * self.corner, q.dtype)
         angle = 2 * jnp.pi * jnp.arange(curve.length // 2 + 1, dtype=q.dtype) / curve.length
-        z = circle(curve.length, q.dtype) * jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
+        z = damping_radius(curve.length, q.dtype) * jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
         return instrument.multiplier(curve.kind == "relaxation", lag, None if self._without_filter() else 1 / corner, z)
 
     def parameters(self, q: Float[Array, " p"]) -> dict[str, Float[Array, ""]]:
-        """K0, K1 (N/mm), B1 (N·s^α/mm) and α, with K_inst and K_eff (N/mm) beside them. `q` (p,) -> scalars."""
+        """K0, K1 (N/mm), B1 (N·s^α/mm), α, K_inst and K_eff (N/mm) by name, from `q` (p,)."""
         K_inst, K_eff, kappa, alpha = q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])
         S = self._taps(alpha)[1]
         K1 = (K_inst - K_eff) * (1 + kappa) * (kappa + S) / (kappa * (1 - S))
@@ -237,13 +245,16 @@ class Sampled(eqx.Module):
         return {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "K_inst": K_inst, "K_eff": K_eff}
 
     def natural(self, q: Float[Array, " p"]) -> Float[Array, " p"]:
-        """The coordinates under their labels: K_inst, K_eff (N/mm), κ, α, lag (ms) and corner (Hz). (p,) -> (p,)."""
+        """Coordinates in the units of their labels: K_inst, K_eff (N/mm), κ, α, lag (ms) and corner (Hz).
+
+        (p,) -> (p,).
+        """
         fitted = [1e3 * self.T * q[4]] if _is_fitted(self.lag) else []
         fitted += [jnp.exp(q[-1]) / (2 * jnp.pi * self.T)] if _is_fitted(self.corner) else []
         return jnp.stack([q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3]), *fitted])
 
     def at(self, tests: Sequence[Test]) -> "Sampled":
-        """The same with numbers as arrays, N among at least 1024 taps: every value is the same compiled function."""
+        """Model with numbers as arrays and room for at least 1024 taps, so that all values share one compilation."""
         del tests
         lag, corner = self.lag, self.corner
         if self._has_instrument():
@@ -256,7 +267,7 @@ class Sampled(eqx.Module):
     def coordinates(
         self, K0: float, K1: float, B1: float, alpha: float, lag: float = 0.0, corner: float = np.inf
     ) -> Float[np.ndarray, " p"]:
-        """q of a parameter set. (p,); K0 and K1 in N/mm, B1 in N·s^α/mm, lag in s, corner in Hz."""
+        """Coordinates q (p,) of a parameter set; K0 and K1 in N/mm, B1 in N·s^α/mm, lag in s, corner in Hz."""
         kappa = K1 * self.T**alpha / B1
         S = float(self._taps(jnp.asarray(alpha))[1])
         ends = K0 + K1 / (1 + kappa), K0 + K1 * S / (kappa + S)
@@ -264,7 +275,7 @@ class Sampled(eqx.Module):
         return np.array([*ends, np.log(kappa), np.log(alpha / (1 - alpha)), *rest])
 
     def _transfer(self, q: Float[Array, " p"], length: int, radius: float) -> Complex[Array, " {length//2+1}"]:
-        """H on the circle with a radius, at the upper half of `length` points."""
+        """H at `length` points on the circle with this radius, upper half."""
         kappa, alpha = jnp.exp(q[2]), jax.nn.sigmoid(q[3])
         taps, S = self._taps(alpha)
         if self.memory == "full":
@@ -280,7 +291,10 @@ class Sampled(eqx.Module):
         return K_eff + size * (C - S) / (kappa + C)
 
     def _taps(self, alpha: Float[Array, ""]) -> tuple[Float[Array, " taps"], Float[Array, ""]]:
-        """c_0 … c_N, zero beyond, and S = C(1), by products of positive numbers."""
+        """Coefficients c_0 … c_N, padded with zeros, and S = C(1).
+
+        Computed from positive factors without cancellation.
+        """
         if self.memory == "full":
             return jnp.ones(1, alpha.dtype), jnp.zeros_like(alpha)
         i = jnp.arange(1, (self.capacity or int(self.N)) + 1, dtype=alpha.dtype)
@@ -290,5 +304,5 @@ class Sampled(eqx.Module):
 
 
 def _is_fitted(value: Any) -> bool:
-    """Whether a lag or a corner is a coordinate."""
+    """Whether a lag or corner is "fit", hence a coordinate."""
     return isinstance(value, str)

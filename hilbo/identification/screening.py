@@ -1,4 +1,4 @@
-"""Where the search for a sampled model begins: the best separate places of a grid in (κ, α)."""
+"""Starting points of the sampled model: the best non-adjacent points of a grid in (κ, α)."""
 
 from typing import Any
 
@@ -17,7 +17,10 @@ __all__ = ["screened", "separate"]
 def screened(
     model: Any, curves: tuple[Curve, ...], scales: list[Float[Array, ""]], grid: Float[Array, "K A 2"]
 ) -> tuple[Float[Array, "K A"], Float[Array, "K A 2"]]:
-    """Cost and stiffnesses (K_inst, K_eff) of the best combination at each place of the grid."""
+    """Cost and best-fitting stiffnesses (K_inst, K_eff) at each grid point (log κ, logit α).
+
+    `scales`: divisor of the residuals of each curve, N. -> (K, A) and (K, A, 2).
+    """
     weights = [jnp.full(c.output.shape[0], 1 / c.output.shape[0], c.scale.dtype) for c in curves]
     ends = jnp.eye(2, dtype=grid.dtype)
 
@@ -38,10 +41,10 @@ def screened(
 
 
 def separate(costs: Float[np.ndarray, "K A"], count: int) -> list[tuple]:
-    """Indices of the lowest costs, none beside another."""
-    left, places = np.where(np.isfinite(costs), costs, np.inf), []
-    while len(places) < count and np.isfinite(left).any():
-        i, j = np.unravel_index(np.argmin(left), left.shape)
-        places.append((i, j))
-        left[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = np.inf
-    return places
+    """Indices of up to `count` lowest costs of which no two are adjacent in the grid."""
+    remaining, indices = np.where(np.isfinite(costs), costs, np.inf), []
+    while len(indices) < count and np.isfinite(remaining).any():
+        i, j = np.unravel_index(np.argmin(remaining), remaining.shape)
+        indices.append((i, j))
+        remaining[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = np.inf
+    return indices

@@ -1,4 +1,4 @@
-"""Warnings about a fit: its search, residuals, instrument and rows."""
+"""Warnings about a fit: convergence, residuals, force channel and sampling of the records."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -9,15 +9,15 @@ from hilbo.identification.beginnings import untared
 from hilbo.identification.estimates import Estimate
 from hilbo.identification.fitting import Fit, Test
 from hilbo.identification.intervals import FEWEST_REPEATS, Intervals, Spread
-from hilbo.identification.misfit import is_coarse, moved_between_rows
+from hilbo.identification.misfit import coarse_kinds, moved_between_rows
 from hilbo.identification.residual_noise import DRIFTS
 
 __all__ = ["recording", "sentences"]
 
-_UNRELATED = 3.0  # times the repeats' own noise, above which the model misses something
-_WIDE, _TICKS = 5.0, 10.0  # medians of the time between rows, and T, above which it is a hole
+_UNRELATED = 3.0  # times the noise of the repeats, above which the model has a systematic error
+_WIDE, _TICKS = 5.0, 10.0  # multiples of the median time step, and of T, above which a step is a gap
 _SURE = 4.0  # standard errors
-_SHARE = 0.2  # of the input's range; what a hole may hide of it
+_SHARE = 0.2  # of the input's range; smallest change in a gap to warn about
 _CERTAIN = 1.75  # half-widths of the 95 % interval: a lag of 0 has a probability of 1 in 2,000
 _SHARE_OF_ERROR = 0.5
 
@@ -30,7 +30,7 @@ def sentences(
     residuals: dict[str, dict[str, Any]],
     tests: Sequence[Test],
 ) -> tuple[str, ...]:
-    """Sentences for a person who would otherwise trust the digits; `residuals` by kind of test."""
+    """Warnings about a characterisation, one sentence each; `residuals` by kind of test (`characterise`)."""
     words = [*_search(best_fit, sides, estimates), *_residuals(residuals), *_instrument(estimates)]
     words += _coarse(best_fit, sampling, tests)
     T = getattr(best_fit.model, "T", np.inf)
@@ -38,7 +38,7 @@ def sentences(
 
 
 def _search(best_fit: Fit, sides: Intervals, estimates: dict[str, Estimate]) -> Iterator[str]:
-    """What the search did not find."""
+    """Yield warnings about convergence, bounds and parameters that are not identifiable."""
     if not bool(best_fit.solution.converged):
         yield "The fit did not converge: the cost is flat in some direction, so no values are printed."
     elif float(sides.lowest) < float(best_fit.solution.cost) * (1 - 1e-4):
@@ -52,7 +52,7 @@ def _search(best_fit: Fit, sides: Intervals, estimates: dict[str, Estimate]) -> 
 
 
 def _residuals(residuals: dict[str, dict[str, Any]]) -> Iterator[str]:
-    """What the residuals hold beside noise."""
+    """Yield warnings about residuals that exceed the noise of the repeats, or drift."""
     for kind, row in residuals.items():
         if row.get("over_repeat_noise", 0.0) > _UNRELATED:
             yield (
@@ -70,7 +70,7 @@ def _residuals(residuals: dict[str, dict[str, Any]]) -> Iterator[str]:
 
 
 def _instrument(estimates: dict[str, Estimate]) -> Iterator[str]:
-    """Lag and filter that were found."""
+    """Yield warnings about a lag or filter found in the force channel."""
     lag, corner = estimates.get("lag"), estimates.get("corner")
     if lag is not None and lag.lower is not None and lag.upper is not None:
         least = abs(lag.value) - _CERTAIN * (lag.upper - lag.lower) / 2
@@ -90,8 +90,8 @@ def _instrument(estimates: dict[str, Estimate]) -> Iterator[str]:
 
 
 def _coarse(best_fit: Fit, sampling: Spread, tests: Sequence[Test]) -> Iterator[str]:
-    """Rows that are further apart than the samples of the rendering, and what hangs on the line between them."""
-    coarse = is_coarse(best_fit.model, tests)
+    """Yield a warning if the rows of a test are further apart than T, with the parameters this affects."""
+    coarse = coarse_kinds(best_fit.model, tests)
     if not coarse:
         return
     moved = np.abs(moved_between_rows(best_fit, tests))
@@ -106,23 +106,23 @@ def _coarse(best_fit: Fit, sampling: Spread, tests: Sequence[Test]) -> Iterator[
 
 
 def recording(test: Test, T: float) -> Iterator[str]:
-    """What is amiss with the recorded input: a step that fell into a hole between rows, a beginning off 0."""
+    """Yield warnings about the recorded input of a test: a large change within a gap, or an untared start."""
     if test.input is None:
         return
-    put, out, time = test.input.mean(axis=0), test.output.mean(axis=0), test.time - test.time[0]
-    apart, change = np.diff(time), np.abs(np.diff(put))
-    hole = (apart > _WIDE * np.median(apart)) & (apart > _TICKS * T) & (change > _SHARE * np.ptp(put))
-    if hole.any():
-        i = int(np.argmax(np.where(hole, change, 0)))
+    applied, measured, time = test.input.mean(axis=0), test.output.mean(axis=0), test.time - test.time[0]
+    step, change = np.diff(time), np.abs(np.diff(applied))
+    gap = (step > _WIDE * np.median(step)) & (step > _TICKS * T) & (change > _SHARE * np.ptp(applied))
+    if gap.any():
+        i = int(np.argmax(np.where(gap, change, 0)))
         yield (
             f"The {test.kind} test has no rows from {time[i]:g} s to {time[i + 1]:g} s, where its input changes by"
-            f" {change[i] / np.ptp(put):.0%} of its range: a straight line was taken there, and values and intervals"
-            " are wrong if the input went another way; record that part with rows as close as elsewhere."
+            f" {change[i] / np.ptp(applied):.0%} of its range: a straight line was taken there, and values and"
+            " intervals are wrong if the input went another way; record that part with rows as close as elsewhere."
         )
-    offset = untared(put, out) if test.start == "rest" else None
+    offset = untared(applied, measured) if test.start == "rest" else None
     if offset is not None and _above_scatter(test.input if offset == "input" else test.output):
         names = ("position", "force") if (offset == "input") == (test.kind == "relaxation") else ("force", "position")
-        first = (put if offset == "input" else out)[0]
+        first = (applied if offset == "input" else measured)[0]
         unit = "mm" if names[0] == "position" else "N"
         yield (
             f"The {test.kind} test does not begin at rest: its first row has a {names[0]} of {first:.3g} {unit} and no"
@@ -132,6 +132,6 @@ def recording(test: Test, T: float) -> Iterator[str]:
 
 
 def _above_scatter(values: np.ndarray) -> bool:
-    """Whether the repeats agree that their first row is not 0. (R, m)."""
+    """Whether the mean first value of `values` (R, m) is over 4 standard errors from 0; True for a single repeat."""
     first, repeats = values[:, 0], values.shape[0]
     return repeats == 1 or bool(abs(first.mean()) > _SURE * np.std(first, ddof=1) / np.sqrt(repeats))

@@ -50,7 +50,9 @@ def test_a_filtered_product_is_that_with_the_autocovariance_matrix():
         jnp.asarray(innovation),
     )
     expected = slopes.T @ toeplitz(lags) @ slopes
-    np.testing.assert_allclose(residual_noise.filtered(jnp.asarray(slopes), model), expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        residual_noise.weighted_normal(jnp.asarray(slopes), model), expected, rtol=1e-9, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("freedom", [5, 12, 100])

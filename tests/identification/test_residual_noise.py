@@ -7,7 +7,7 @@ import pytest
 from material import FOAM, foam_tests, position
 from scipy.signal import lfilter
 
-from hilbo.identification.residual_noise import DRIFTS, autoregression, filtered
+from hilbo.identification.residual_noise import DRIFTS, autoregression, weighted_normal
 from hilbo.identification.sampled import Sampled
 
 M = 1500
@@ -38,7 +38,7 @@ def test_a_random_walk_is_drift_and_widens_the_interval_of_a_mean(described):
     for number in range(60):
         r = white(number) + walk(number)
         model = described(jnp.asarray(r - r.mean()))
-        variance = filtered(jnp.ones((M, 1)), model)[0, 0] * r.var() / M**2
+        variance = weighted_normal(jnp.ones((M, 1)), model)[0, 0] * r.var() / M**2
         errors.append(float(model.drift))
         ratios.append(r.mean() / np.sqrt(variance))
     assert np.mean(np.array(errors) < DRIFTS) > 0.8
