@@ -29,7 +29,7 @@ from hilbo.device.messages import Status
 from hilbo.device.parameter_sets import InForce, in_force, wanted_for
 from hilbo.device.ports import BAUD, list_ports, open_port
 from hilbo.device.reasons import Capability, NackReason, State, held_because, meaning
-from hilbo.device.staging import patiently, put_in_force
+from hilbo.device.staging import put_in_force, retry_while_busy
 from hilbo.device.telemetry import Counts, Samples, TelemetryBuffer, joined
 from hilbo.errors import InputError
 
@@ -242,7 +242,7 @@ class Renderer:
         and raises `DeviceError`.
         """
         clear = protocol.Clear(boot_id=self.device.boot_id, stop=self._link.stops if stop is None else stop)
-        patiently(self._link, self.device, clear, self._link.now() + _SINKS)
+        retry_while_busy(self._link, self.device, clear, self._link.now() + _SINKS)
 
     def status(self) -> Status:
         """State and counters."""

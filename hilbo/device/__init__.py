@@ -1,5 +1,4 @@
-"""The host's half of the device: frames, messages, the link with its heartbeats, parameter sets on their way, and the
-simulated device.
+"""Host side of the device: frames, messages, link with heartbeats, transfer of parameter sets, and simulated device.
 
 Imports `mechanics` (for the exponentials of full memory, when they are needed) and `errors`; never JAX on import.
 """

@@ -1,7 +1,7 @@
-"""The bytes that a line brings: from its port, or from the helper process that reads the port in its place.
+"""Source of the bytes received on a line: the port itself, or the helper process that reads the port instead.
 
-One thread reads. Two processes that read one line would each get a part of what it brings, so the port changes hands in
-order: the reading thread lets go, the helper starts, and the thread goes on with what the helper passes on, to its end.
+Two processes reading one line would each get part of the data, so only one thread reads, and the port changes hands in
+order: the reading thread lets go, the helper starts, and the thread continues with the helper's output until it ends.
 """
 
 import threading
@@ -14,43 +14,46 @@ __all__ = ["Arrivals"]
 
 
 class Arrivals:
-    """Bytes of a `ports.Port`. `read` is for one thread alone, the others for the one that starts a helper."""
+    """Bytes received on a `ports.Port`.
+
+    `read` is for one thread only, the other methods for the thread that starts a helper.
+    """
 
     def __init__(self, port: Any):
         self._port = port
         self._change = threading.Condition()
-        self._handing_over = self._let_go = self._over = False
+        self._handing_over = self._released = self._over = False
         self._helper: HelperHeart | None = None
 
     def read(self) -> bytes:
-        """What has arrived, after a short wait; empty if nothing has. Raises OSError when the line is gone."""
+        """Return the bytes that have arrived, after a short wait; empty if none. Raises OSError if the line is lost."""
         with self._change:
-            self._let_go = self._handing_over
+            self._released = self._handing_over
             self._change.notify_all()
             self._change.wait_for(lambda: not self._handing_over or self._over)
-            self._let_go, helper = False, self._helper
+            self._released, helper = False, self._helper
         if helper is None:
             return self._port.read()
         data = helper.read(POLL)
-        if data is None:  # it has ended, and all of it is read
+        if data is None:  # the helper has ended, and all of its output is read
             with self._change:
                 self._helper = None if self._helper is helper else self._helper
         return data or b""
 
     def hand_over(self) -> None:
-        """Returns once nobody reads the port; `resume` comes next."""
+        """Pause reading; return once the reading thread no longer uses the port. `resume` must follow."""
         with self._change:
             self._handing_over = True
-            self._change.wait_for(lambda: self._let_go or self._over)
+            self._change.wait_for(lambda: self._released or self._over)
 
     def resume(self, helper: HelperHeart | None) -> None:
-        """Go on reading: from this helper, or from the port as before."""
+        """Continue reading, from `helper`, or from the port if it is None."""
         with self._change:
             self._helper, self._handing_over = helper or self._helper, False
             self._change.notify_all()
 
     def end(self) -> None:
-        """Nobody will read any more: let nobody wait for that."""
+        """Mark the end of reading, so that no call waits for the reading thread any more."""
         with self._change:
             self._over = True
             self._change.notify_all()

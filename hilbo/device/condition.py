@@ -1,4 +1,4 @@
-"""What a device tells of itself beside its state and its sets: homed or not, hardware stop, delay, continuous force."""
+"""Condition of a device besides its state and sets: homing, hardware stop, delay and continuous force."""
 
 from typing import NamedTuple
 
@@ -9,10 +9,11 @@ __all__ = ["Condition", "condition_of"]
 
 
 class Condition(NamedTuple):
-    """`delay_us` is the delay for which sets are checked, `longest_delay_us` the longest since the device's start.
+    """Condition of a device.
 
-    Both are times from a due tick to its force, µs. `continuous_force_N` is the root mean square over about `heating_s`
-    that the motor bears.
+    `delay_us` is the delay for which sets are checked, `longest_delay_us` the longest since the device's start, both
+    from a due tick to its force, µs. `continuous_force_N` is the root mean square force over about `heating_s` that the
+    motor tolerates.
     """
 
     homed: bool
@@ -24,7 +25,7 @@ class Condition(NamedTuple):
 
 
 def condition_of(status: Status, limits: Limits) -> Condition:
-    """The condition that a STATUS and a LIMITS message describe."""
+    """Combine a STATUS and a LIMITS message into a `Condition`."""
     return Condition(
         bool(status.flags & DeviceFlag.HOMED),
         bool(status.flags & DeviceFlag.STOP_OPEN),

@@ -1,7 +1,7 @@
-"""The C header with the numbers of a device, `hilbo_device_config.h`, that a port of the firmware is built with.
+"""C header `hilbo_device_config.h` with the numbers of a device, with which a port of the firmware is built.
 
-`header` writes a whole one from what a device reports. `with_measured` changes damping and delay in the header that the
-device was built with, and leaves the rest, such as the settings of a port, as it is.
+`header` writes a complete one from what a device reports. `with_measured` changes damping and delay in the header that
+the device was built with, and keeps the rest, such as the settings of a port.
 """
 
 import re
@@ -72,7 +72,7 @@ static const struct hb_config HILBO_DEVICE_CONFIG = {{
 def header(
     device: HelloReply, limits: Limits, damping: float, delay_us: int, about_damping: str, about_delay: str
 ) -> str:
-    """The whole header, for a damping in N·s/m and a delay in µs; `about_…` are comments on how these were measured."""
+    """Complete header for a damping in N·s/m and a delay in µs; `about_…` are comments on how these were measured."""
     fastest = device.velocity_limit_mm_per_s
     numbers = asdict(device) | asdict(limits)
     numbers |= {"damping": _below(damping), "plausible_step_mm": 2 * fastest / device.tick_rate_Hz}
@@ -84,10 +84,10 @@ def header(
 
 
 def with_measured(base: str, where: str, device: HelloReply, limits: Limits, damping: float, delay_us: int) -> str:
-    """A device's header `base` with other values of damping (N·s/m) and delay (µs).
+    """Replace damping (N·s/m) and delay (µs) in the header `base`; `where` is its file name for errors.
 
-    `where` is the name of its file. Raises `InputError` where the header lacks one of the two, or has another value
-    than the device reports: then it is the header of another device.
+    Raises `InputError` if the header lacks one of the two, or has another value than the device reports, so that it
+    belongs to another device.
     """
     reported = {"damping_N_s_per_m": device.damping_N_s_per_m, "delay_us": limits.delay_us}
     values = {"damping_N_s_per_m": _c_float(_below(damping)), "delay_us": str(delay_us)}
@@ -106,11 +106,11 @@ def with_measured(base: str, where: str, device: HelloReply, limits: Limits, dam
 
 
 def _below(value: float) -> float:
-    """The largest binary32 that is not above the value."""
+    """Largest binary32 number that does not exceed the value."""
     nearest = np.float32(value)
     return float(nearest if nearest <= value else np.nextafter(nearest, np.float32(-np.inf)))
 
 
 def _c_float(value: float) -> str:
-    """A literal whose binary32 is that of the value."""
+    """C literal of the value rounded to binary32."""
     return f"{np.format_float_positional(np.float32(value), trim='0')}F"

@@ -1,9 +1,9 @@
-"""Frames on a serial line: COBS with 0x00 at the end and a CRC-32 inside. Knows no messages.
+"""Frames on a serial line: COBS with a terminating 0x00 and a CRC-32; independent of the messages in them.
 
-    frame = COBS(body) 0x00,  body = type:u8 seq:u8 payload:0..64 bytes crc:u32,  crc = CRC-32 of what is before it
+    frame = COBS(body) 0x00,  body = type:u8 seq:u8 payload:0..64 bytes crc:u32,  crc = CRC-32 of the bytes before it
 
-A damaged frame is dropped and counted, and the next 0x00 starts afresh.
-Reference: Cheshire & Baker (1999), Consistent Overhead Byte Stuffing.
+A damaged frame is dropped and counted; the next 0x00 resynchronises. Reference: Cheshire & Baker (1999), Consistent
+Overhead Byte Stuffing.
 """
 
 import zlib
@@ -16,11 +16,11 @@ LONGEST = 71  # bytes of a frame without its 0x00
 
 
 class WireError(ValueError):
-    """A frame or a payload that is not of this protocol; the message says in which way."""
+    """A frame or payload that violates the protocol; the message describes the violation."""
 
 
 class Frame(NamedTuple):
-    """A body that came through whole."""
+    """Type, sequence number and payload of an intact frame."""
 
     type: int
     seq: int
@@ -28,7 +28,10 @@ class Frame(NamedTuple):
 
 
 def closed(frame: Frame) -> bytes:
-    """The bytes of a frame, its 0x00 included. Runs are shorter than COBS's 254 bytes, because bodies are."""
+    """Encode a frame to bytes, including its 0x00. Raises `WireError` for a payload that is too long.
+
+    Bodies are shorter than 254 bytes, so that COBS needs no long runs.
+    """
     if len(frame.payload) > PAYLOAD:
         raise WireError(f"a payload of {len(frame.payload)} bytes, more than {PAYLOAD}")
     body = bytes((frame.type, frame.seq)) + frame.payload
@@ -37,7 +40,7 @@ def closed(frame: Frame) -> bytes:
 
 
 def opened(frame: bytes) -> Frame:
-    """What is in a frame without its 0x00. Raises `WireError` for one that is damaged."""
+    """Decode a frame given without its 0x00. Raises `WireError` for a damaged one."""
     if len(frame) > LONGEST:
         raise WireError(f"{len(frame)} bytes without 0x00, more than {LONGEST}")
     body = _unstuffed(frame)
@@ -49,21 +52,21 @@ def opened(frame: bytes) -> Frame:
 
 
 class Receiver:
-    """Collects bytes up to each 0x00 and yields the frames that came through; `dropped` counts the others.
+    """Split incoming bytes at each 0x00 and decode the frames; `dropped` counts the damaged ones.
 
-    Whatever arrives, it holds at most a frame's bytes, and the next 0x00 starts afresh.
+    At most the bytes of one frame are buffered.
     """
 
     def __init__(self):
         self.dropped = 0
-        self._held = b""
+        self._buffer = b""
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that these bytes complete."""
-        *whole, rest = (self._held + data).split(b"\0")
-        self._held = rest[: LONGEST + 1]  # one byte too many is enough to know that it is too long
+        """Return the frames that these bytes complete."""
+        *complete, rest = (self._buffer + data).split(b"\0")
+        self._buffer = rest[: LONGEST + 1]  # one byte too many marks the frame as too long
         frames = []
-        for frame in filter(None, whole):
+        for frame in filter(None, complete):
             try:
                 frames.append(opened(frame))
             except WireError:
@@ -72,12 +75,12 @@ class Receiver:
 
 
 def _unstuffed(frame: bytes) -> bytes:
-    """The body in a frame without its 0x00."""
-    runs, place = [], 0
-    while place < len(frame):
-        end = place + frame[place]
+    """Remove the COBS encoding of a frame given without its 0x00. Raises `WireError` for invalid COBS."""
+    runs, position = [], 0
+    while position < len(frame):
+        end = position + frame[position]
         if end > len(frame):
             raise WireError("no COBS: a run ends beyond the frame")
-        runs.append(frame[place + 1 : end])
-        place = end
+        runs.append(frame[position + 1 : end])
+        position = end
     return b"\0".join(runs)

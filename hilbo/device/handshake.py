@@ -1,6 +1,6 @@
-"""The first words with a device: is it one, does it mean the same bytes, is it stopped, has it the damping it needs.
+"""Start of a connection: check protocol version, watchdog, damping and delay of a device, and take it over at rest.
 
-Whoever comes second takes over a device at rest: one that still moves for an earlier host is told to stop first.
+A device that still moves for an earlier host is stopped first.
 """
 
 import math
@@ -20,14 +20,14 @@ __all__ = ["greet", "shortest", "take_over"]
 
 _BOOT = 3.0  # s that a board may take to start when its port is opened
 _STOPPING = 2.0  # s
-_BEATS = 4  # heartbeats that must fit into the device's watchdog: each carries the tick of the answer before
+_BEATS = 4  # heartbeats that must fit into the device's watchdog, since each carries the tick of an earlier answer
 
 
 def greet(link: Link, damping: SupportsFloat | None, delay: SupportsFloat | None = None) -> HelloReply:
-    """HELLO, until a board that starts when its port is opened has started; checks what it says.
+    """Send HELLO, repeatedly while a board starts up, and check the reply.
 
     Raises `InputError` for a device with less damping than `damping` (N·s/m) or more delay than `delay` (s),
-    `DeviceError` for one that is not of this protocol.
+    `DeviceError` for one with another protocol version or too short a watchdog.
     """
     give_up = time.monotonic() + _BOOT
     while True:
@@ -61,7 +61,10 @@ def greet(link: Link, damping: SupportsFloat | None, delay: SupportsFloat | None
 
 
 def _check_delay(link: Link, delay: float) -> None:
-    """A device refuses sets that are not passive at its own delay; a study that counts on less would propose them."""
+    """Raise `InputError` if the device's delay exceeds the `delay` (s) that the study assumes.
+
+    The device refuses sets that are not passive at its own delay, so a study that assumes less would propose such sets.
+    """
     if not 0.0 <= delay < math.inf:
         raise InputError(f"The delay that the study counts on is {delay}; give a number from 0, in s.")
     own = link.request(protocol.GetLimits()).delay_us
@@ -73,7 +76,7 @@ def _check_delay(link: Link, delay: float) -> None:
 
 
 def take_over(link: Link, device: HelloReply) -> list[str]:
-    """Make sure that the device rests, and begin the heartbeats; returns what a person should know."""
+    """Stop the device if it still moves, and begin the heartbeats. Returns notes to report."""
     notes = []
     status = link.request(protocol.GetStatus())
     if status.state in (State.RUNNING, State.DRIVING, State.STOPPING):
@@ -94,11 +97,12 @@ def take_over(link: Link, device: HelloReply) -> list[str]:
 
 
 def shortest(value: float) -> str:
-    """The shortest decimal of a number's binary32: read again, it is the same to the device."""
-    import numpy as np  # which commands that say no number need not wait for
+    """Shortest decimal that rounds to the same binary32 as the value."""
+    import numpy as np  # slow to import, and not needed by all commands
 
     return np.format_float_positional(np.float32(value), trim="-")
 
 
 def _f32(value: float) -> float:
+    """Value rounded to binary32."""
     return struct.unpack("<f", struct.pack("<f", value))[0]

@@ -1,11 +1,10 @@
-"""One conversation over one line: requests with answers, heartbeats, and unsolicited messages.
+"""Connection to a device over one line: requests with answers, heartbeats, and unsolicited messages.
 
-One request is in flight at a time; without an answer the same bytes are sent again, three times in all. A thread reads
-beside the caller's, and a heart beats (`hilbo.device.heartbeat`): while a request waits, while this process computes,
-and for as long as it lives. Whatever ends the conversation ends the heartbeats, and so does a request that stays
-unanswered: the device then lets go. A START or DRIVE without an answer is followed by a STOP. ESTOP waits for no other
-request, and STOP and ESTOP are tried on a line that is lost one way only. firmware/PROTOCOL.md has the rules and the
-bytes.
+One request is in flight at a time; without an answer the same bytes are sent again, three times in all. A thread of its
+own reads, and heartbeats are sent (`hilbo.device.heartbeat`) while a request waits and while this process computes. The
+end of the connection for any reason ends the heartbeats, and so does a request that stays unanswered: the device then
+goes to HOLD. A START or DRIVE without an answer is followed by a STOP. ESTOP waits for no other request, and STOP and
+ESTOP are tried on a line that is lost in one direction only. firmware/PROTOCOL.md has the rules and the bytes.
 """
 
 import contextlib
@@ -35,18 +34,18 @@ _ANSWER = {
     protocol.Echo: protocol.EchoReply,
 }
 _URGENT = frozenset({code_of(protocol.Stop), code_of(protocol.Estop)})
-_ALWAYS = (protocol.Hello, protocol.GetStatus, protocol.Stop, protocol.Estop)  # are for restarted devices too
+_ALWAYS = (protocol.Hello, protocol.GetStatus, protocol.Stop, protocol.Estop)  # allowed for a restarted device too
 
 
 class Link:
-    """A conversation over a `ports.Port`, from construction to `close`.
+    """Connection over a `ports.Port`, from construction to `close`.
 
-    `boot_id` is the device's, once known, `stops` its count of stops as last heard, `heard` its newest tick. `faint` is
-    why heartbeats have ended, empty while they have not.
-    `patience` is how long (s) an answer may take. `ticks` runs so many ticks of 1 ms of a device whose time is ours:
-    it passes in `pause` alone then, and nothing beats by a clock. Counted: `retries`, `stray` answers that fit no
-    request, `strange` frames that are no message of a device, `dropped` frames; `round_trips` has the last answers'
-    times (s).
+    `boot_id`: the device's start, once known; `stops`: its count of stops as last reported; `heard`: its newest tick;
+    `faint`: why heartbeats have ended, empty while they continue; `lost`: why the line is lost, else None. `patience`:
+    timeout (s) of an answer; `tries`: attempts per request; `capture` receives all bytes read. `ticks` advances a
+    simulated device by a number of 1 ms ticks: its time then passes only in `pause`, and no clock is used. Counters:
+    `retries`, `stray` answers that match no request, `strange` frames that are no message of a device, `dropped`
+    frames; `round_trips`: times (s) of the last answers.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class Link:
         self.on_telemetry: Callable[[Telemetry], None] | None = None
         self._port, self._capture, self._receiver = port, capture, Receiver()
         self._ticks, self._passed = ticks, 0
-        self._seq = random.randrange(256)  # an earlier host's last request must not look like this one's first
+        self._seq = random.randrange(256)  # differs from the last request of an earlier host
         self._expected: tuple[int, int, type] | None = None
         self._answer: Message = None
         self._asking, self._writing, self._news = threading.Lock(), threading.Lock(), threading.Condition()
@@ -87,13 +86,17 @@ class Link:
 
     @property
     def dropped(self) -> int:
-        """Damaged frames that arrived here."""
+        """Number of damaged frames received."""
         return self._receiver.dropped
 
     def request(self, message: Message) -> Message:
-        """The answer to a request. Raises `RefusalError` or `DeviceError`, each with one sentence."""
+        """Send a request and return its answer.
+
+        Raises `RefusalError` for refused numbers, `InputError` for numbers that do not fit the message, else
+        `DeviceError`.
+        """
         if isinstance(message, protocol.Estop) and not self.lost:
-            self._hush(True)  # should the line lose every ESTOP, the device's watchdog ends its force
+            self._hush(True)  # if every ESTOP is lost, the device's watchdog ends its force
             self.shout(message)
         if isinstance(message, protocol.Stop | protocol.Estop) and self.lost:
             raise DeviceError(failures.urgent(self.lost, name_of(type(message)), self.shout(message)))
@@ -112,7 +115,7 @@ class Link:
                     raise DeviceError(self._unanswered(kind))
             except BaseException:
                 if kind in (protocol.Start, protocol.Drive):
-                    self.shout(protocol.Stop())  # it may move
+                    self.shout(protocol.Stop())  # the device may be moving
                 raise
         if isinstance(answer, Nack):
             raise self._refusal(answer, name_of(kind))
@@ -121,7 +124,7 @@ class Link:
         return answer
 
     def _unanswered(self, kind: type) -> str:
-        """Why, in a sentence. A device that does not answer is left without heartbeats."""
+        """Error message for a request without an answer; ends the heartbeats of a known device."""
         foreign = bool(self._receiver.dropped) and self.boot_id is None
         why = failures.silent(self.name, name_of(kind), self.tries, received=self.received > 0, foreign=foreign)
         if self.boot_id is None:
@@ -131,6 +134,10 @@ class Link:
         return failures.deserted(why)
 
     def _ask(self, frame, expected) -> Message:
+        """Send a frame and wait for the `expected` answer (sequence number, request code, class).
+
+        None after all tries.
+        """
         with self._news:
             self._expected, self._answer = expected, None
         for attempt in range(self.tries):
@@ -150,9 +157,11 @@ class Link:
         return None
 
     def shout(self, message: Message) -> bool:
-        """STOP or ESTOP onto the line at once: past every lock, and where the line is lost. Whether it took them.
+        """Write STOP or ESTOP to the line at once, bypassing all locks, even if the line is lost.
 
-        The 0x00 in front ends whatever frame another thread has begun; the device obeys both in every state.
+        Return whether it was written.
+
+        The leading 0x00 ends any frame another thread has begun; the device accepts both messages in every state.
         """
         try:
             self._port.write(b"\0" + protocol.encode(message, 0))
@@ -161,9 +170,9 @@ class Link:
         return True
 
     def write(self, data: bytes) -> None:
-        """Bytes onto the line, whole frames only. Raises `DeviceError` when the line is gone."""
+        """Write complete frames to the line. Raises `DeviceError` if the line is lost."""
         try:
-            with self._writing:  # which `close` takes too, so that no port is closed under a writer's hands
+            with self._writing:  # taken by `close` too, so that no port is closed during a write
                 if self.lost:
                     raise DeviceError(self.lost)
                 self._port.write(data)
@@ -171,7 +180,10 @@ class Link:
             raise DeviceError(self._lose(error)) from error
 
     def beat(self, boot_id: int | None) -> None:
-        """From now on heartbeats for this start of the device, or with None no heartbeats."""
+        """Start heartbeats for this start of the device; with None stop them.
+
+        Raises `DeviceError` if the helper does not start.
+        """
         self.boot_id = boot_id
         self._end_beats()
         if boot_id is None:
@@ -186,12 +198,13 @@ class Link:
             raise DeviceError(f"The process that sends heartbeats cannot be started: {error}.") from error
         finally:
             self._arrivals.resume(self._heart if isinstance(self._heart, HelperHeart) else None)
-        if self._quiet:  # meanwhile, as below
+        if self._quiet:  # set while the helper was starting
             self._hush(True)
         if self.lost:
             self._end_beats()
 
     def _end_beats(self) -> None:
+        """Stop the heartbeats; return after the last one."""
         with self._news:
             heart, self._heart = self._heart, None
         if isinstance(heart, HelperHeart):
@@ -201,7 +214,7 @@ class Link:
 
     @contextlib.contextmanager
     def silence(self) -> Iterator[None]:
-        """No heartbeats within this block, to test the watchdog."""
+        """Suspend the heartbeats within this block, to test the watchdog."""
         boot_id = self.boot_id
         self.beat(None)
         try:
@@ -210,12 +223,12 @@ class Link:
             self.beat(boot_id)
 
     def heartbeat(self) -> None:
-        """One heartbeat, now, if the device is known and no ESTOP waits for its answer."""
+        """Send one heartbeat now, unless the device is unknown or an ESTOP waits for its answer."""
         if self.boot_id is not None and not self._quiet:
             self.write(protocol.encode(protocol.Heartbeat(boot_id=self.boot_id, tick=self.heard.tick), 0))
 
     def _hush(self, quiet: bool) -> None:
-        """Stop the heartbeats at once, or go on with them."""
+        """Pause the heartbeats at once, or resume them."""
         with self._news:
             self._quiet, heart = quiet, self._heart
         if isinstance(heart, HelperHeart):
@@ -223,15 +236,18 @@ class Link:
 
     @property
     def ours(self) -> bool:
-        """Whether the device's time is ours, and passes in `pause` alone."""
+        """Whether the device's time is simulated, and passes only in `pause`."""
         return self._ticks is not None
 
     def now(self) -> float:
-        """Seconds, from anywhere on, of the clock that `pause` goes by."""
+        """Time (s, arbitrary origin) of the clock that `pause` uses."""
         return self._passed / 1000 if self.ours else time.monotonic()
 
     def pause(self, seconds: float) -> None:
-        """Let so much time pass; where it is ours, with heartbeats, until everything the device sent has been read."""
+        """Wait for `seconds`.
+
+        Advance a device with simulated time, with heartbeats, until everything it sent has been read.
+        """
         if self._ticks is None:
             time.sleep(seconds)
             return
@@ -244,7 +260,7 @@ class Link:
             self.request(protocol.GetStatus())
 
     def close(self) -> None:
-        """Ends the heartbeats and the reading, and closes the port."""
+        """End the heartbeats and the reading thread, and close the port."""
         self._closing.set()
         with self._news:
             self.lost = self.lost or f"{self.name}: the connection has been closed; open it again."
@@ -252,20 +268,23 @@ class Link:
         self._arrivals.end()
         self.beat(None)
         if self._reader is not threading.current_thread():
-            self._reader.join()  # a port neither reads nor writes for long
+            self._reader.join()  # reads and writes of a port are short
         with self._writing:
             self._port.close()
 
     def _beat_here(self) -> None:
+        """Send a heartbeat from this process. Raises OSError if the line is lost."""
         try:
             self.heartbeat()
         except DeviceError as error:
             raise OSError(str(error)) from error
 
     def _fainted(self) -> None:
+        """Record that the helper process has ended."""
         self.faint = self.faint or failures.fainted(self.name)
 
     def _read(self) -> None:
+        """Loop of the reading thread, until the connection is closed or lost."""
         while not self._closing.is_set():
             try:
                 data = self._arrivals.read()
@@ -274,11 +293,12 @@ class Link:
                 return
             try:
                 self._heard(data)
-            except Exception as error:  # of whoever takes what arrives: without a reader nobody may go on beating
+            except Exception as error:  # of a receiver; without a reader the heartbeats must end
                 self._end(failures.not_taken(self.name, error))
                 return
 
     def _heard(self, data: bytes) -> None:
+        """Process received bytes: count, capture, and handle each complete frame."""
         self.received += len(data)
         if self._capture is not None and data:
             self._capture(data)
@@ -286,6 +306,7 @@ class Link:
             self._take(frame)
 
     def _take(self, frame) -> None:
+        """Decode a frame and dispatch it to the telemetry receiver, the notices or the waiting request."""
         try:
             message = protocol.decode(frame)
         except WireError:
@@ -303,7 +324,7 @@ class Link:
             self._give(frame.seq, message)
 
     def _learn(self, message: Message) -> None:
-        """What any message tells beside its own purpose: that the device has restarted, its tick, its stops."""
+        """Update restart flag, newest tick and count of stops from any message."""
         if isinstance(message, HelloReply):
             self.heard.tick = message.tick
         elif isinstance(message, Notice | Status | Pulse) and self.boot_id not in (None, message.boot_id):
@@ -316,19 +337,20 @@ class Link:
             self.stops = message.ticks
 
     def _give(self, seq, message) -> None:
-        """Hands an answer to the request that waits for it; others are counted and dropped."""
+        """Deliver an answer to the waiting request; count and drop it if it does not match."""
         with self._news:
             if self._expected is not None and self._answer is None and _fits(seq, message, self._expected):
                 self._answer = message
                 self._news.notify_all()
-            elif not (isinstance(message, Ack) and message.request in _URGENT and seq == 0):  # of a shout
+            elif not (isinstance(message, Ack) and message.request in _URGENT and seq == 0):  # the answer to `shout`
                 self.stray += 1
 
     def _lose(self, error: OSError) -> str:
+        """Mark the line as lost after an OSError; return the reason."""
         return self._end(failures.line_gone(self.name, error))
 
     def _end(self, why: str) -> str:
-        """The conversation is over, and so are the heartbeats; returns why it ended first."""
+        """Mark the connection as lost and end the heartbeats; return the first reason given."""
         with self._news:
             self.lost = self.lost or why
             self._news.notify_all()
@@ -338,6 +360,7 @@ class Link:
         return why
 
     def _refusal(self, nack: Nack, request: str) -> Exception:
+        """Error for a NACK; sets `restarted` if the NACK shows a restarted device."""
         if nack.reason in (NackReason.BOOT_ID, NackReason.NO_HELLO) and request != "HELLO":
             self.restarted = True
             return DeviceError(failures.restarted(self.name), nack)
@@ -345,7 +368,7 @@ class Link:
 
 
 def _fits(seq: int, message: Message, expected: tuple[int, int, type]) -> bool:
-    """Whether a message answers the request that waits."""
+    """Whether a message answers the waiting request `expected`."""
     wanted, request, kind = expected
     acknowledges = isinstance(message, Ack | Nack) and message.request == request
     return seq == wanted and (acknowledges or (type(message) is kind and kind is not Ack))

@@ -1,7 +1,7 @@
-"""What host and device say to each other: one frozen dataclass for each message of firmware/PROTOCOL.md.
+"""Messages between host and device: one frozen dataclass for each message of firmware/PROTOCOL.md.
 
-The annotations are the layout on the wire: PROTOCOL.md's schema can be printed from them (`protocol.schema_text`), and
-a test holds that against the file, byte for byte. Names, units and meaning of the fields are explained there.
+The annotations define the layout on the wire: `protocol.schema_text` prints PROTOCOL.md's schema from them, and a test
+compares it with the file, byte for byte. Names, units and meaning of the fields are explained there.
 """
 
 import re
@@ -48,7 +48,7 @@ __all__ = [
 
 VERSION = 2
 SCHEMA = 0xEEF43481
-"""CRC-32 of the schema block of PROTOCOL.md: which bytes both sides mean."""
+"""CRC-32 of the schema block of PROTOCOL.md, by which both sides check that their layouts agree."""
 
 U8 = Annotated[int, "u8"]
 U16 = Annotated[int, "u16"]
@@ -58,6 +58,7 @@ F32 = Annotated[float, "f32"]
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def _message(kind):
+    """Make a class a message: a frozen, slotted dataclass with keyword-only fields."""
     return dataclass(frozen=True, slots=True, kw_only=True)(kind)
 
 
@@ -69,7 +70,7 @@ class Exponential(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """One tick's telemetry; `sensed_N` is None where the device was not asked for it."""
+    """Telemetry of one tick; `sensed_N` is None if it was not requested."""
 
     position_counts: int
     flags: int
@@ -345,10 +346,10 @@ _TYPES = {kind: code for code, kind in MESSAGES.items()}
 
 
 def code_of(kind: type) -> int:
-    """The type byte of a class of messages."""
+    """Type byte of a message class."""
     return _TYPES[kind]
 
 
 def name_of(kind: type) -> str:
-    """A class's name in PROTOCOL.md: SET_PARAMS for SetParams."""
+    """Name of a message class in PROTOCOL.md: SET_PARAMS for SetParams."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", kind.__name__).upper()

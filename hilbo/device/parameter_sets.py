@@ -1,6 +1,6 @@
-"""A parameter set from what is wanted of a device to what it reports: its messages on the wire, their CRC, and back.
+"""Parameter sets of a device: conversion to messages and back, CRC, and comparison with what the device reports.
 
-Numbers are rounded to binary32 on the wire, once; everything after that is compared bit for bit.
+Numbers are rounded to binary32 once, for the wire; from there on they are compared bit for bit.
 """
 
 import math
@@ -30,7 +30,7 @@ _WIRE_NAMES = {
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """What a device is to render, or has in force.
+    """Parameter set to be rendered by a device.
 
     K0, K1 in N/mm, B1 in N·s^α/mm, `force_limit` in N. `memory` is "short" or "full"; `length` is N of short memory, or
     the number of exponentials of full memory.
@@ -45,7 +45,10 @@ class ParameterSet:
     force_limit: float
 
     def messages(self, set_id: int, tick_rate: int) -> list[SetParams | SetStates]:
-        """SET_PARAMS, and with full memory the SET_STATES that follow it; `tick_rate` in Hz. Raises `InputError`."""
+        """SET_PARAMS message, followed for full memory by SET_STATES; `tick_rate` in Hz.
+
+        Raises `InputError` for invalid numbers.
+        """
         if self.memory not in ("short", "full"):
             raise InputError(f'memory is "{self.memory}"; it must be "short" or "full".')
         for name in ("K0", "K1", "B1", "alpha", "force_limit"):
@@ -61,14 +64,17 @@ class ParameterSet:
 
 @dataclass(frozen=True)
 class InForce(ParameterSet):
-    """A set as a device has it, rounded to binary32; `needs` is the damping (N·s/m) that the device computed for it."""
+    """Parameter set in force on a device, rounded to binary32.
+
+    `needs`: damping (N·s/m) it requires, computed by the device.
+    """
 
     set_id: int
     needs: float
     crc: int
 
     def _asdict(self) -> dict[str, Any]:
-        """As logs and `--json` have it: flat, the id first."""
+        """Flat dict for logs and `--json`, with the id first."""
         return {"set_id": self.set_id} | asdict(self)
 
 
@@ -85,10 +91,11 @@ def wanted_for(
     states: int = 10,
     force_limit: SupportsFloat | None = None,
 ) -> ParameterSet:
-    """A set for a device, whose own force limit is the default. Raises `InputError` for what cannot be sent.
+    """Parameter set for a device, with its own force limit as the default.
 
-    Units as in `ParameterSet`, T in s. Full memory loads JAX here, so that it is there when the set has to be sent in a
-    hurry.
+    Raises `InputError` for one that cannot be sent.
+
+    Units as in `ParameterSet`, T in s. Full memory imports JAX here already, so that sending the set later is fast.
     """
     rate = device.tick_rate_Hz
     if not abs(rate * _number("T", T) - 1) < 1e-9:
@@ -102,6 +109,7 @@ def wanted_for(
 
 
 def _number(name: str, value: SupportsFloat) -> float:
+    """Convert a value to float. Raises `InputError` if that fails."""
     try:
         return float(value)
     except (TypeError, ValueError):
@@ -109,12 +117,12 @@ def _number(name: str, value: SupportsFloat) -> float:
 
 
 def crc_of(messages: Sequence[SetParams | SetStates]) -> int:
-    """What device and host know a set by."""
+    """CRC-32 that identifies a set on device and host."""
     return zlib.crc32(b"".join(payload_of(message) for message in messages))
 
 
 def in_force(reply: Set) -> InForce | None:
-    """The set in a SET message, None where the device has none."""
+    """Parameter set of a SET message; None if the device has none."""
     if not reply.flags & 1:
         return None
     numbers = {name: getattr(reply, wire) for name, wire in _WIRE_NAMES.items()}
@@ -123,21 +131,21 @@ def in_force(reply: Set) -> InForce | None:
 
 
 def differences(sent: Sequence[SetParams | SetStates], reply: Set) -> list[str]:
-    """In what the device's set is not, bit for bit, the one that was sent."""
+    """Names of the fields in which the device's set differs, bit for bit, from the one that was sent."""
     if not reply.flags & 1:
         return ["no set"]
     names = ("set_id", "memory", *_WIRE_NAMES.values())
-    wrong = [name for name in names if _bits(getattr(reply, name)) != _bits(getattr(sent[0], name))]
-    return wrong + (["crc"] if reply.crc != crc_of(sent) else [])
+    differing = [name for name in names if _bits(getattr(reply, name)) != _bits(getattr(sent[0], name))]
+    return differing + (["crc"] if reply.crc != crc_of(sent) else [])
 
 
 def _bits(value: float | int) -> bytes | int:
-    """What is compared: an integer itself, a number as its binary32."""
+    """Value for comparison: an integer itself, a float as its binary32 bytes."""
     return struct.pack("<f", value) if isinstance(value, float) else value
 
 
 def _states(set_id: int, alpha: float, count: int) -> list[SetStates]:
-    """The exponentials of full memory, as many to a message as fit."""
+    """SET_STATES messages with the exponentials of full memory. Raises `InputError` for an invalid count or alpha."""
     if count not in STATES:
         raise InputError(f"states is {count}; it must be one of {', '.join(map(str, STATES))}.")
     if not 0 < alpha < 1:

@@ -1,6 +1,6 @@
-"""Lines to a device: a serial port (pyserial) or a TCP socket, with one sentence for whatever keeps them from opening.
+"""Ports to a device: serial port (pyserial) or TCP socket, with a clear error if one cannot be opened.
 
-A port reads what has arrived, waiting for at most `POLL` seconds, and writes; both raise OSError when it is gone.
+Reading waits at most `POLL` seconds for data; reading and writing raise OSError if the line is lost.
 """
 
 import contextlib
@@ -16,54 +16,51 @@ __all__ = ["BAUD", "POLL", "Port", "PortInfo", "SerialPort", "SocketPort", "list
 BAUD = 921_600
 """Line rate (baud) where none is given; a pseudo-terminal and a USB device have none of their own."""
 POLL = 0.05  # s
-_STUCK = 10.0  # s, until a line that takes no bytes is given up
+_STUCK = 10.0  # s, write timeout
 _NO_PYSERIAL = "Serial ports need pyserial; install it with: pip install 'hilbo[hardware]'."
 _BUSY = {errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK}
 
 
 class PortInfo(NamedTuple):
-    """A serial port of this computer."""
+    """Serial port of this computer."""
 
     name: str
     description: str
 
 
 class SerialPort:
-    """A serial port, or a pseudo-terminal; nobody else can open it meanwhile.
-
-    Raises `InputError` if it cannot be opened.
-    """
+    """Serial port or pseudo-terminal, opened exclusively. Raises `InputError` if it cannot be opened."""
 
     def __init__(self, name: str, baud: int = BAUD):
         self.name = name
         self._serial: Any = _opened(name, baud)
 
     def fileno(self) -> int:
-        """The number by which the system knows the open line."""
+        """File descriptor of the open port."""
         return self._serial.fileno()
 
     def read(self) -> bytes:
-        """What has arrived, after a short wait; empty if nothing has. Raises OSError if the line is gone."""
+        """Return the bytes that have arrived, after a short wait; empty if none. Raises OSError if the line is lost."""
         try:
             return self._serial.read(max(1, self._serial.in_waiting))
         except TypeError as error:
             raise _closed() from error
 
     def write(self, data: bytes) -> None:
-        """All of the bytes. Raises OSError if the line is gone."""
+        """Write all of the bytes. Raises OSError if the line is lost."""
         try:
             self._serial.write(data)
         except TypeError as error:
             raise _closed() from error
 
     def close(self) -> None:
-        """Give the line back; twice is no error."""
+        """Close the port; calling it twice is no error."""
         with contextlib.suppress(OSError):
             self._serial.close()
 
 
 class SocketPort:
-    """A connected stream socket."""
+    """Port over a connected TCP socket."""
 
     def __init__(self, connected: socket.socket, name: str):
         self.name = name
@@ -71,11 +68,14 @@ class SocketPort:
         self._socket.settimeout(POLL)
 
     def fileno(self) -> int:
-        """The number by which the system knows the open line."""
+        """File descriptor of the socket."""
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """What has arrived, after a short wait; empty if nothing has. Raises OSError if the other side has gone."""
+        """Return the bytes that have arrived, after a short wait; empty if none.
+
+        Raises OSError if the peer has disconnected.
+        """
         try:
             data = self._socket.recv(4096)
         except TimeoutError:
@@ -85,30 +85,30 @@ class SocketPort:
         return data
 
     def write(self, data: bytes) -> None:
-        """All of the bytes. Raises OSError if the other side has gone."""
+        """Send all of the bytes. Raises OSError if the peer has disconnected."""
         self._socket.sendall(data)
 
     def close(self) -> None:
-        """Give the line back; twice is no error."""
+        """Close the socket; calling it twice is no error."""
         self._socket.close()
 
 
 def _closed() -> OSError:
-    """What pyserial means by a TypeError: its port was closed by another thread while it read or wrote."""
+    """OSError in place of pyserial's TypeError for a port closed by another thread during a read or write."""
     return OSError(errno.EBADF, "the port is closed")
 
 
 Port = SerialPort | SocketPort
-"""Anything with `name`, `read`, `write` and `close` will do; with `fileno`, heartbeats come from their own process."""
+"""Any object with `name`, `read`, `write` and `close`; with `fileno`, a helper process sends the heartbeats."""
 
 
 def open_port(where: str, baud: int = BAUD) -> Port:
-    """The line called `where`: a port's name, or socket://host:port. Raises `InputError`."""
+    """Open a serial port by name, or socket://host:port. Raises `InputError` if it cannot be opened."""
     return _connected(where) if where.startswith("socket://") else SerialPort(where, baud)
 
 
 def list_ports() -> list[PortInfo]:
-    """The serial ports of this computer. Raises `InputError` without pyserial."""
+    """List the serial ports of this computer. Raises `InputError` without pyserial."""
     try:
         from serial.tools.list_ports import comports
     except ImportError as error:
@@ -117,6 +117,7 @@ def list_ports() -> list[PortInfo]:
 
 
 def _connected(where):
+    """Connect to socket://host:port. Raises `InputError` for a bad address or a failed connection."""
     host, separator, number = where.removeprefix("socket://").rpartition(":")
     if not (separator and host and number.isdigit()):
         raise InputError(f'"{where}" is no address; write it like socket://192.168.0.7:5000.')
@@ -130,18 +131,20 @@ def _connected(where):
 
 
 def _opened(name, baud):
+    """Open a pyserial port exclusively. Raises `InputError` if it cannot be opened."""
     try:
         import serial
     except ImportError as error:
         raise InputError(_NO_PYSERIAL) from error
     try:
-        # Exclusive, so that two programs never talk to one device.
+        # Exclusive, so that no two programs use one device.
         return serial.Serial(name, baud, timeout=POLL, write_timeout=_STUCK, exclusive=True)
     except (OSError, ValueError) as error:
         raise InputError(_why_not(name, baud, error)) from error
 
 
 def _why_not(name, baud, error) -> str:
+    """Error message for a serial port that cannot be opened."""
     number = getattr(error, "errno", None)
     if number in _BUSY or "exclusively lock" in str(error):
         return f"{name}: another program uses this port; close it, or choose another port."

@@ -1,9 +1,8 @@
-"""The wire protocol: bytes in, messages out. firmware/PROTOCOL.md is the contract, this the host's half of it.
+"""Wire protocol of the device: conversion between messages and bytes, as specified in firmware/PROTOCOL.md.
 
-Nothing here reads, writes or waits. `encode` makes a message into a frame's bytes, `Receiver` finds frames in bytes
-and counts what it drops, `decode` makes a frame into a message. Messages are in `messages`, the frame codec is in
-`frames`, the numbers with names and their sentences in `reasons`; all of them are names of this module too.
-Numbers are rounded to binary32 where they are packed.
+Nothing here does I/O. `encode` converts a message to the bytes of a frame, `Receiver` extracts frames from bytes and
+counts damaged ones, `decode` converts a frame to a message. The names of `messages`, `frames` and `reasons` are
+re-exported here. Numbers are rounded to binary32 when they are packed.
 """
 
 import re
@@ -121,7 +120,10 @@ _CODES = {"u8": "B", "u16": "H", "u32": "I", "i16": "h", "f32": "f"}
 
 
 class _Layout(NamedTuple):
-    """`head` packs the fields `names`; `tail` is what repeats, `row` packs one of it, `wide` one with its option."""
+    """Binary layout of a message: `head` packs the fields `names`.
+
+    `tail` is the repeated field, `row` packs one of its items, `wide` one with its optional value.
+    """
 
     head: struct.Struct
     names: tuple[str, ...]
@@ -131,12 +133,13 @@ class _Layout(NamedTuple):
 
 
 def _wire(kind: type) -> dict[str, str]:
-    """What the annotations say: the schema's word for each field."""
+    """Field name -> its type in the schema, from the annotations of a message class."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: get_args(hints[field.name])[1] for field in fields(kind)}
 
 
 def _layout(kind: type) -> _Layout:
+    """Binary layout of a message class, from its annotations."""
     wire = _wire(kind)
     names = tuple(name for name, word in wire.items() if word in _CODES)
     tail = next((name for name in wire if name not in names), None)
@@ -150,7 +153,7 @@ _LAYOUTS = {kind: _layout(kind) for kind in MESSAGES.values()}
 
 
 def schema_text() -> str:
-    """The schema block of PROTOCOL.md as these classes have it."""
+    """Schema block of PROTOCOL.md, generated from the message classes."""
     lines = [f"version {VERSION}"]
     for code, kind in MESSAGES.items():
         words = [word if word.startswith("n*") else f"{name}:{word}" for name, word in _wire(kind).items()]
@@ -159,7 +162,10 @@ def schema_text() -> str:
 
 
 def payload_of(message: Message) -> bytes:
-    """The bytes of a message. Raises `WireError` where a number does not fit its field, or the message the payload."""
+    """Pack the payload of a message.
+
+    Raises `WireError` for a number that does not fit its field, or too long a payload.
+    """
     layout = _LAYOUTS[type(message)]
     try:
         payload = layout.head.pack(*(getattr(message, name) for name in layout.names))
@@ -173,6 +179,7 @@ def payload_of(message: Message) -> bytes:
 
 
 def _rows(layout, rows) -> bytes:
+    """Pack the items of a message's repeated field."""
     if isinstance(rows, bytes):
         return rows
     return b"".join(
@@ -181,7 +188,10 @@ def _rows(layout, rows) -> bytes:
 
 
 def decode(frame: Frame) -> Message:
-    """The message in a frame. Raises `WireError` for an unknown type, another length, and reserved fields not 0."""
+    """Unpack the message in a frame.
+
+    Raises `WireError` for an unknown type, a wrong length, or a reserved field not 0.
+    """
     if frame.type not in MESSAGES:
         raise WireError(f"type {frame.type:#04x} is not of this protocol")
     kind = MESSAGES[frame.type]
@@ -198,6 +208,7 @@ def decode(frame: Frame) -> Message:
 
 
 def _unpack_rows(kind, layout, values, rest):
+    """Unpack the items of a message's repeated field. Raises `WireError` for an incomplete item."""
     if kind in (Echo, EchoReply):
         return rest
     wide = kind is Telemetry and values["fields"] & 1
@@ -209,19 +220,19 @@ def _unpack_rows(kind, layout, values, rest):
 
 
 def encode(message: Message, seq: int) -> bytes:
-    """The whole frame of a message, its 0x00 included."""
+    """Encode a message to the bytes of a frame, including its 0x00."""
     return closed(Frame(code_of(type(message)), seq, payload_of(message)))
 
 
 def frames_in(capture: bytes) -> Iterator[tuple[int, Message | WireError, Frame | None]]:
-    """Everything in captured bytes: where each frame begins, its message or what is wrong, and the frame if whole."""
-    place = 0
+    """Yield for each frame in captured bytes: its offset, its message or the error, and the frame (None if damaged)."""
+    offset = 0
     for raw in capture.split(b"\0"):
         frame = None
         if raw:
             try:
                 frame = opened(raw)
-                yield place, decode(frame), frame
+                yield offset, decode(frame), frame
             except WireError as error:
-                yield place, error, frame
-        place += len(raw) + 1
+                yield offset, error, frame
+        offset += len(raw) + 1

@@ -1,6 +1,6 @@
-"""The numbers with names of firmware/PROTOCOL.md, and a sentence for each that a person may have to read.
+"""Named numbers of firmware/PROTOCOL.md (states, flags, reasons), and messages that explain them to a person.
 
-`sentence` turns a NACK into words with the numbers it carries: what is wrong, and what to do about it.
+`sentence` explains a NACK with the numbers it carries: what is wrong, and what to do about it.
 """
 
 from enum import IntEnum, IntFlag
@@ -22,14 +22,14 @@ __all__ = [
 
 
 class Memory(IntEnum):
-    """Of a parameter set."""
+    """Memory of a parameter set."""
 
     SHORT = 0
     FULL = 1
 
 
 class Staging(IntEnum):
-    """Of the idle bank."""
+    """Status of the idle bank, into which the next set is sent."""
 
     EMPTY = 0
     INCOMPLETE = 1
@@ -38,7 +38,7 @@ class Staging(IntEnum):
 
 
 class State(IntEnum):
-    """Of the device."""
+    """State of the device."""
 
     STOPPED = 0
     RUNNING = 1
@@ -49,7 +49,7 @@ class State(IntEnum):
 
 
 class Capability(IntFlag):
-    """What a device can do."""
+    """Capabilities of a device."""
 
     DRIVE = 1
     FORCE_SENSOR = 2
@@ -66,7 +66,7 @@ class DeviceFlag(IntFlag):
 
 
 class SampleFlag(IntFlag):
-    """What happened in a tick. Saturated and slewed mark a trial, HOLD and ESTOP void it."""
+    """Events in a tick. SATURATED and SLEWED mark a trial, HOLD and ESTOP void it."""
 
     CONTACT = 1
     INPUT_HELD = 2
@@ -81,7 +81,7 @@ class SampleFlag(IntFlag):
 
 
 class HoldReason(IntEnum):
-    """Why the device is in HOLD, or why its state changed."""
+    """Reason why the device is in HOLD, or why its state changed."""
 
     NONE = 0
     WATCHDOG = 1
@@ -97,7 +97,7 @@ class HoldReason(IntEnum):
 
 
 class NackReason(IntEnum):
-    """Why a request is refused."""
+    """Reason why a request is refused."""
 
     VERSION = 1
     SCHEMA = 2
@@ -136,7 +136,7 @@ class NackReason(IntEnum):
 
 
 ABOUT_INPUT = frozenset(NackReason(n) for n in range(9, 21)) | {NackReason.LINE_TOO_SLOW, NackReason.DRIVE_RANGE}
-"""Refusals that whoever chose the numbers can fix."""
+"""Refusals caused by the numbers sent, which the sender can correct."""
 
 _HOLD = {
     HoldReason.NONE: "it was asked to",
@@ -206,17 +206,17 @@ _WAY_OUT = {
 
 
 def meaning(names: type[IntEnum], number: int) -> str:
-    """The name of a number; one that this version does not know stays a number."""
+    """Name of a number in an enumeration; an unknown number as text."""
     return names(number).name if number in names._value2member_map_ else f"{names.__name__.lower()} {number}"
 
 
 def held_because(reason: int) -> str:
-    """Why a device is in HOLD or changed its state, in words."""
+    """Text for the reason why a device is in HOLD or changed its state."""
     return _HOLD[HoldReason(reason)] if reason in HoldReason._value2member_map_ else f"of reason {reason}"
 
 
 def sentence(reason: int, request: str, ticks: int, value: float, limit: float) -> str:
-    """A NACK of `request` (its name in PROTOCOL.md) in words."""
+    """Explain a NACK of `request` (its name in PROTOCOL.md) in words."""
     if reason not in NackReason._value2member_map_:
         return f"The device refuses {request} for reason {reason}, which this hilbo does not know; install a newer one."
     state = int(value) if reason == NackReason.STATE and value == value else 0

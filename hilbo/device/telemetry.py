@@ -1,6 +1,7 @@
-"""Telemetry as it arrives: samples of the device's ticks, kept until they are asked for.
+"""Buffer of telemetry: samples of the device's ticks, stored until they are taken.
 
-Ticks are the device's only clock, 32 bits of it on the wire; here they count on for ever. Units: ticks, s, mm, N.
+Ticks are the device's only clock, 32 bits on the wire; here they are continued without wrapping. Units: ticks, s, mm,
+N.
 """
 
 import threading
@@ -14,7 +15,7 @@ from hilbo.device.messages import Telemetry
 
 __all__ = ["Counts", "Samples", "TelemetryBuffer", "joined"]
 
-_MOST = 200_000  # messages: some twenty minutes at 1 kHz
+_MOST = 200_000  # messages: about twenty minutes at 1 kHz
 
 
 class Samples(NamedTuple):
@@ -27,7 +28,7 @@ class Samples(NamedTuple):
     flags: np.ndarray
 
     def table(self, tick_s: float, begun: int | None = None) -> Any:
-        """As a pandas table, with `time_s` from the tick `begun` on, or from the first sample's."""
+        """Pandas table of the samples, with `time_s` from the tick `begun`, or from the first sample."""
         import pandas as pd
 
         since = (self.tick - (self.tick[:1].sum() if begun is None else begun)) * tick_s
@@ -36,13 +37,16 @@ class Samples(NamedTuple):
 
 
 def joined(pieces: Sequence[Samples]) -> Samples:
-    """Pieces one after the other."""
+    """Concatenate pieces of telemetry."""
     return Samples(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
 
 
 class Counts(NamedTuple):
-    """What has arrived, and what has not: `dropped` by the device for want of room, `missing` on the way or there;
-    `unread`: what had arrived and was given up here, because nobody asked for it for long."""
+    """Counts of samples.
+
+    `samples` received; `dropped` by the device for lack of room; `missing`: lost on the way or there; `unread`:
+    received and discarded here, because they were not taken for too long.
+    """
 
     samples: int
     dropped: int
@@ -51,7 +55,7 @@ class Counts(NamedTuple):
 
 
 class TelemetryBuffer:
-    """Messages in, `Samples` out; filled by one thread, emptied by another."""
+    """Buffer from telemetry messages to `Samples`; filled by one thread, emptied by another."""
 
     def __init__(self, encoder_step_mm: float):
         self._step = encoder_step_mm
@@ -63,7 +67,7 @@ class TelemetryBuffer:
         self.newest: Telemetry | None = None
 
     def add(self, message: Telemetry) -> None:
-        """One message, in the order of arrival."""
+        """Add a message, in the order of arrival."""
         if not message.samples:
             return
         with self._news:
@@ -83,28 +87,28 @@ class TelemetryBuffer:
 
     @property
     def tick(self) -> int:
-        """The tick after the newest sample, or 0 before the first."""
+        """Tick after the newest sample; 0 before the first."""
         with self._news:
             return self._next or 0
 
     def counts(self) -> Counts:
-        """Since the buffer was made."""
+        """Counts since the buffer was created."""
         with self._news:
             return Counts(self._samples, self._dropped, self._missing, self._unread)
 
     @property
     def much(self) -> bool:
-        """Whether so much waits to be taken that it should be."""
+        """Whether the buffer is more than half full and should be emptied."""
         return len(self._messages) > _MOST // 2
 
     def wait(self, timeout: float) -> bool:
-        """Whether something new came within `timeout` seconds."""
+        """Wait up to `timeout` seconds for new samples; return whether any came."""
         with self._news:
             seen = self._samples
             return self._news.wait_for(lambda: self._samples != seen, timeout)
 
     def take(self) -> Samples:
-        """Everything that has come since the last call, oldest first."""
+        """Remove and return all samples since the last call, oldest first."""
         with self._news:
             messages = list(self._messages)
             self._messages.clear()

@@ -1,4 +1,4 @@
-"""The firmware on this computer: compiled, as a process behind a pseudo-terminal, or as a library in this process.
+"""The firmware on this computer: compilation, as a process behind a pseudo-terminal, or as a library in this process.
 
-For simulated devices, and programs that close the loop themselves.
+For simulated devices, and for programs that close the control loop themselves.
 """

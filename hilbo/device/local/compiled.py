@@ -1,7 +1,7 @@
-"""Programs and libraries of the firmware's C sources, for this computer.
+"""Compilation of the firmware's C sources for this computer, to programs and shared libraries.
 
-The sources travel with hilbo. They are built once with the C compiler that is there, into the user's cache folder,
-under a name made of sources, compiler and flags, so that nothing stale is ever run.
+The sources are part of hilbo. They are compiled once with the available C compiler, into the user's cache folder; the
+cache key is a hash of sources, compiler and flags, so that no stale build is used.
 """
 
 import hashlib
@@ -24,10 +24,10 @@ _COMPILERS = ("cc", "gcc", "clang")
 
 
 def compiled(name: str, what: str, parts: Sequence[str], sources: Sequence[str] = (), shared: bool = False) -> Path:
-    """The program (or shared library) `name`, built if this computer has not built it before.
+    """Path of the program (or shared library) `name`, compiled if it is not in the cache.
 
-    `what` names it in sentences. `parts`: the folders of its headers and sources. `sources`: patterns of the C files,
-    if not all of these folders. Raises `DeviceError` where it cannot be built, and says what to install.
+    `what` names it in error messages. `parts`: the folders of its headers and sources. `sources`: patterns of the C
+    files, if not all of these folders. Raises `DeviceError` if it cannot be built, with what to install.
     """
     root, compiler = _sources(what), _compiler(what)
     files = [path for folder in parts for path in sorted((root / folder).glob("*.[ch]"))]
@@ -46,7 +46,7 @@ def compiled(name: str, what: str, parts: Sequence[str], sources: Sequence[str] 
 
 
 def _build(program: Path, what: str, command: Sequence[str], root: Path) -> None:
-    """Build beside the final place and move it there whole, so that two who build at once do no harm."""
+    """Compile in a temporary folder and move the result to its place, so that concurrent builds do not interfere."""
     try:
         program.parent.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(prefix="build-", dir=program.parent))
@@ -67,6 +67,7 @@ def _build(program: Path, what: str, command: Sequence[str], root: Path) -> None
 
 
 def _sources(what: str) -> Path:
+    """Folder of the firmware's sources. Raises `DeviceError` if it is missing."""
     here = Path(__file__).parents[2]
     for root in (here / "firmware", here.parent / "firmware"):  # installed; a checkout
         if (root / "core").is_dir():
@@ -75,6 +76,7 @@ def _sources(what: str) -> Path:
 
 
 def _compiler(what: str) -> str:
+    """Path of the C compiler: $CC, cc, gcc or clang. Raises `DeviceError` if there is none."""
     for name in (os.environ.get("CC", ""), *_COMPILERS):
         path = shutil.which(name) if name else None
         if path:
@@ -87,9 +89,10 @@ def _compiler(what: str) -> str:
 
 
 def _firmware_hash(root: Path) -> int:
-    """As firmware/Makefile has it: the CRC-32 of the core's sources."""
+    """CRC-32 of the core's sources, as in firmware/Makefile."""
     return zlib.crc32(b"".join(path.read_bytes() for path in sorted((root / "core").glob("*.[ch]"))))
 
 
 def _cache() -> Path:
+    """Cache folder of hilbo."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hilbo"

@@ -1,13 +1,13 @@
-"""The firmware's core in this process, for a program that closes the loop itself: `HostRenderer`, by ctypes.
+"""The firmware's core in this process, for a program that closes the control loop itself: `HostRenderer`, by ctypes.
 
     with HostRenderer(numbers) as renderer:
         renderer.set(K0=0.1, K1=0.6, B1=0.5, alpha=0.3)
         while True:                                              # each period, in a thread of its own
             force = renderer.tick(position, velocity, time.perf_counter())
 
-It is `libhilbo_renderer`, built once with the C compiler of this computer; firmware/port/library/hilbo_renderer.h has
-its rules. The library computes forces and the motor is the program's: what happens when the program hangs or is killed
-is the device's matter (docs/device/host-port.md). Python at 1 kHz is for simulated devices and for tests: a garbage
+It is `libhilbo_renderer`, compiled once with the C compiler of this computer; firmware/port/library/hilbo_renderer.h
+has its rules. The library computes forces and the program drives the motor: if the program hangs or is killed, the
+device itself must react (docs/device/host-port.md). Python at 1 kHz is for simulated devices and for tests: a garbage
 collection or another thread may cost a tick, which is a HOLD.
 """
 
@@ -31,14 +31,14 @@ _ROOM = 256  # bytes for a sentence
 
 
 class Fate:
-    """Of the set that was given last."""
+    """Status of the parameter set given last."""
 
     NONE, WAITING, IN_FORCE, REFUSED = range(4)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceNumbers:
-    """What the device is; struct hilbo_device_numbers in hilbo_renderer.h says what each number means."""
+    """Properties of the device; struct hilbo_device_numbers in hilbo_renderer.h documents each number."""
 
     simulated: bool = False
     passivity_controller: bool = False
@@ -64,7 +64,7 @@ class DeviceNumbers:
 
 
 class HostState(NamedTuple):
-    """Of a renderer; struct hilbo_state in hilbo_renderer.h says what each number means."""
+    """State of a renderer; struct hilbo_state in hilbo_renderer.h documents each number."""
 
     state: int
     cause: int
@@ -146,7 +146,7 @@ def library() -> ctypes.CDLL:
 
 
 class HostRenderer:
-    """A renderer in this process, STOPPED and without a set. Raises `InputError` for numbers out of their range.
+    """Renderer in this process, initially STOPPED and without a set. Raises `InputError` for numbers out of range.
 
     Every method may be called from any thread, `tick` from one only.
     """
@@ -154,7 +154,7 @@ class HostRenderer:
     def __init__(self, numbers: DeviceNumbers):
         self._lib, self.numbers = library(), numbers
         given = {
-            name: _Range(*value) if isinstance(value, tuple) else _whole(value)
+            name: _Range(*value) if isinstance(value, tuple) else _fits_u32(value)
             for name, value in asdict(numbers).items()
         }
         why = ctypes.c_char_p()
@@ -171,7 +171,7 @@ class HostRenderer:
         self.close()
 
     def close(self) -> None:
-        """Free it, when no other call runs. Nothing else may be called after it."""
+        """Free the renderer, while no other call runs. No method may be called after it."""
         handle, self._handle = self._handle, None
         self._lib.hilbo_close(handle)
 
@@ -186,9 +186,10 @@ class HostRenderer:
         exponentials: Sequence[tuple[float, float]] = (),
         force_limit: float | None = None,
     ) -> None:
-        """Check a set and stage it; it is put in force at the first tick that may (`state().set`).
+        """Check a set and stage it; it is put in force at the first tick that allows it (`state().set`).
 
-        Units: N/mm, N·s^α/mm, N. `exponentials` are (weight, loss) of full memory, in place of N. Raises `InputError`.
+        Units: N/mm, N·s^α/mm, N. `exponentials`: (weight, loss) pairs of full memory, instead of N. Raises
+        `InputError`.
         """
         limit = self.numbers.force_limit_N if force_limit is None else force_limit
         packed = _packed(K0, K1, B1, alpha, N, exponentials, limit)
@@ -196,69 +197,73 @@ class HostRenderer:
             raise InputError(self.sentence())
 
     def start(self, stops: int) -> None:
-        """Render, from out of contact; `stops` of the `state()` that was looked at. Raises `DeviceError`."""
+        """Start rendering, from out of contact; `stops` is that of the `state()` inspected before.
+
+        Raises `DeviceError`.
+        """
         if self._lib.hilbo_start(self._handle, stops):
             raise DeviceError(self.sentence())
 
     def clear(self, stops: int) -> None:
-        """HOLD or ESTOP -> STOPPED; `stops` as in `start`. Raises `DeviceError`."""
+        """Change from HOLD or ESTOP to STOPPED; `stops` as in `start`. Raises `DeviceError`."""
         if self._lib.hilbo_clear(self._handle, stops):
             raise DeviceError(self.sentence())
 
     def stop(self) -> None:
-        """Force to zero within `hold_ticks`, then STOPPED."""
+        """Ramp the force to zero within `hold_ticks`, then STOPPED."""
         self._lib.hilbo_stop(self._handle)
 
     def estop(self) -> None:
-        """Force zero at the next tick, latched."""
+        """Emergency stop: force zero at the next tick, latched."""
         self._lib.hilbo_estop(self._handle)
 
     def heartbeat(self) -> None:
-        """The thread that gives the orders is alive; at least every `watchdog_ticks`, better three times as often."""
+        """Report that the controlling thread is alive; at least every `watchdog_ticks`, better three times as often."""
         self._lib.hilbo_heartbeat(self._handle)
 
     def tick(self, position_mm: float, velocity_mm_per_s: float, time_s: float) -> float:
-        """The force (N) for one period; NaN for what the device does not give."""
+        """Compute the force (N) for one period; NaN for a quantity that the device does not provide."""
         return self._tick(self._handle, position_mm, velocity_mm_per_s, time_s)
 
     def state(self) -> HostState:
-        """How it is now."""
+        """Current state."""
         packed = _State()
         self._lib.hilbo_get_state(self._handle, ctypes.byref(packed))
         return HostState(*(getattr(packed, name) for name in HostState._fields))
 
     def sentence(self) -> str:
-        """What was refused last, and why."""
+        """Message about the last refusal."""
         text = ctypes.create_string_buffer(_ROOM)
         self._lib.hilbo_sentence(self._handle, text, _ROOM)
         return text.value.decode()
 
     def why(self) -> str:
-        """The state in words, and why it is in it."""
+        """Current state and its cause, in words."""
         now = self.state()
         return f"{State(now.state).name}: {self._lib.hilbo_cause_in_words(now.cause).decode()}"
 
 
 def K0_of(*, K_eff: float, K1: float, B1: float, alpha: float, N: int = 101, tick_rate_Hz: int = 1000) -> float:
-    """K0 (N/mm) of a set of short memory whose static stiffness is K_eff, as the library computes it.
+    """K0 (N/mm) of a short-memory set whose static stiffness is K_eff, as computed by the library.
 
-    Raises `InputError` for an N that is no whole number, `DeviceError` where the library cannot be built.
+    Raises `InputError` for an N that is not an integer, `DeviceError` if the library cannot be built.
     """
     packed = _packed(0.0, K1, B1, alpha, N, (), math.nan)
     return library().hilbo_K0_of(ctypes.byref(packed), tick_rate_Hz, K_eff)
 
 
 def _packed(K0: float, K1: float, B1: float, alpha: float, N: int, exponentials: Any, limit: float) -> _Set:
+    """C struct of a parameter set. Raises `InputError` for too many exponentials or an N that does not fit 32 bits."""
     if len(exponentials) > _MOST_EXPONENTIALS:
         raise InputError(f"There are {len(exponentials)} exponentials; a set has at most {_MOST_EXPONENTIALS}.")
-    packed = _Set(K0, K1, B1, alpha, limit, 0 if exponentials else _whole(N), len(exponentials))
+    packed = _Set(K0, K1, B1, alpha, limit, 0 if exponentials else _fits_u32(N), len(exponentials))
     for k, (weight, loss) in enumerate(exponentials):
         packed.weight[k], packed.loss[k] = weight, loss
     return packed
 
 
-def _whole(value: Any) -> Any:
-    """A number; one that C's 32 bits without sign do not hold is refused here."""
+def _fits_u32(value: Any) -> Any:
+    """Pass a number through. Raises `InputError` for an integer that does not fit 32 unsigned bits."""
     if isinstance(value, int) and not 0 <= value < 2**32:
         raise InputError(f"{value} must be at least 0 and below 2^32.")
     return value

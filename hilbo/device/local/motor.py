@@ -1,10 +1,10 @@
-"""A simulated device for programs that close the loop: `hilbo-motor` as a process, with mass, damping and a finger.
+"""Simulated device for programs that close the control loop: process `hilbo-motor`, with mass, damping and a finger.
 
     with SimulatedMotor(finger="all") as motor:
         position, velocity = motor.sample()
         motor.command(force)                 # every period: after 15 ms without a new command its force is zero
 
-It stands for a device's driver. The two sides share a file in memory; firmware/port/library/hilbo_motor.h has its
+It stands for a device's driver. The two sides share memory through a file; firmware/port/library/hilbo_motor.h has its
 layout, and a program in C or C++ opens the same `file`.
 """
 
@@ -44,7 +44,7 @@ MOTOR = DeviceNumbers(
     velocity_limit_mm_per_s=1000.0,
     plausible_step_mm=2.0,
 )
-"""What the simulated device is."""
+"""Properties of the simulated device."""
 
 
 class _Shared(ctypes.Structure):
@@ -59,17 +59,18 @@ class _Shared(ctypes.Structure):
 
 
 def motor_program() -> Path:
-    """The program, built if this computer has not built it before. Raises `DeviceError` where it cannot be."""
+    """Path of the program, compiled if it is not in the cache. Raises `DeviceError` if it cannot be built."""
     if os.name != "posix":
         raise DeviceError("The simulated motor needs POSIX (Linux, macOS); on Windows use WSL.")
     return compiled("hilbo-motor", "the simulated motor", _PARTS, _SOURCES)
 
 
 class SimulatedMotor:
-    """A running simulated device, whose process ends with this one. `finger`: none, rest, ramp, hold, sine, tap, all.
+    """Running simulated device, whose process ends with this one. `finger`: none, rest, ramp, hold, sine, tap or all.
 
-    `record`: a file for time (CLOCK_MONOTONIC, ns), force and position of each of its ticks, written at its end.
-    Raises `DeviceError` where its program cannot be built or does not start.
+    `silence_ms`: time without a command after which its force is zero; `record`: file for time (CLOCK_MONOTONIC, ns),
+    force and position of each tick, written at the end. Raises `DeviceError` if its program cannot be built or does not
+    start.
     """
 
     def __init__(self, finger: str = "all", silence_ms: float = 15.0, record: Path | None = None):
@@ -94,15 +95,15 @@ class SimulatedMotor:
 
     @property
     def felt_N(self) -> float:
-        """The force that is put out now."""
+        """Force that is output now, N."""
         return self._shared.felt_N
 
     def sample(self) -> tuple[float, float]:
-        """The newest position (mm) and velocity (mm/s)."""
+        """Newest position (mm) and velocity (mm/s)."""
         return self._shared.position_mm, self._shared.velocity_mm_per_s
 
     def command(self, force_N: float) -> None:
-        """A force (N), positive outwards, until the next one, or for as long as the motor believes it."""
+        """Set the force (N, positive outwards), valid until the next command or for `silence_ms`."""
         self._shared.force_N = force_N
         self._shared.commands += 1
 

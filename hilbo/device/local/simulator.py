@@ -1,7 +1,7 @@
-"""A device without a device: the firmware's own core as a process on a pseudo-terminal of this computer.
+"""Simulated device: the firmware's core as a process on a pseudo-terminal of this computer.
 
-The C sources travel with hilbo, and are built once (`hilbo.device.local.compiled`). The process ends with this one,
-however this one ends, because the pipe that it reads its commands from ends then.
+The C sources are part of hilbo and are compiled once (`hilbo.device.local.compiled`). The process ends with this one in
+every case, because the pipe from which it reads its commands ends then.
 """
 
 import contextlib
@@ -21,17 +21,17 @@ _PARTS = ("core", "port/sim", "port/host")
 
 
 class Simulator:
-    """A running simulated device; `port` is the name of its pseudo-terminal.
+    """Running simulated device; `port` is the name of its pseudo-terminal.
 
     Options are those of `hilbo-device --help`, with _ for -: finger="sine", material=(-2.89, 5.7, 5.89, 0.203, 101),
-    damping=0.95, sensor=False, … With `rate="lockstep"` its time is ours: it passes where the host waits for it, as
-    fast as both can, and nothing depends on this computer's clock. Raises `DeviceError` where none can be built or
-    started.
+    damping=0.95, sensor=False, … With `rate="lockstep"` its time passes only where the host waits for it, as fast as
+    both can, independent of this computer's clock. Raises `DeviceError` if it cannot be built, `InputError` if it does
+    not start.
     """
 
     def __init__(self, *, rate: str = "realtime", **options: Any):
         arguments = [str(built()), "--control", "--rate", rate, *_arguments(options)]
-        # A group of its own: Ctrl-C is for the host, which then stops the device and ends it.
+        # A process group of its own: the host handles Ctrl-C, stops the device and ends it.
         self._process = subprocess.Popen(
             arguments,
             stdin=subprocess.PIPE,
@@ -50,7 +50,7 @@ class Simulator:
         return self._process.poll() is None
 
     def tell(self, command: str) -> str:
-        """One of the commands of `hilbo-device --help` ("restart", "finger sine", …); returns its answer.
+        """Send a command of `hilbo-device --help` ("restart", "finger sine", …) and return its answer.
 
         Raises `DeviceError` if the device has ended.
         """
@@ -64,21 +64,23 @@ class Simulator:
             return self._answer()
 
     def ticks(self, count: int) -> str:
-        """Run so many ticks, in lockstep. Raises `DeviceError` if the process has ended."""
+        """Run `count` ticks, in lockstep. Raises `DeviceError` if the process has ended."""
         answer = self.tell(f"tick {count}")
         if not answer.startswith("tick "):
             raise DeviceError("The simulated device has ended; open a new one.")
         return answer
 
     def close(self) -> str:
-        """End the process; its last words say how many ticks it ran, and how many were late."""
+        """End the process; return its final report: ticks run, and how many were late."""
         return self._ended()
 
     def _answer(self) -> str:
+        """Next line of the process's output."""
         assert self._process.stdout is not None
         return self._process.stdout.readline().decode().strip()
 
     def _ended(self) -> str:
+        """Close and end the process; return its error output."""
         if self._process.stderr is None or self._process.stderr.closed:
             return ""
         with contextlib.suppress(OSError, ValueError):
@@ -95,9 +97,9 @@ class Simulator:
 
 
 def built() -> Path:
-    """The simulated device's program, built if this computer has not built it before.
+    """Path of the simulated device's program, compiled if it is not in the cache.
 
-    Raises `DeviceError` where it cannot be built or run, and says what to install.
+    Raises `DeviceError` if it cannot be built or run, with what to install.
     """
     if os.name != "posix":
         raise DeviceError(
@@ -107,6 +109,7 @@ def built() -> Path:
 
 
 def _arguments(options: dict[str, Any]) -> list[str]:
+    """Command-line arguments for the options; `sensor=False` becomes --no-sensor."""
     arguments = []
     for name, value in options.items():
         if name == "sensor":

@@ -1,4 +1,4 @@
-"""A device's own mechanics: its signs, its friction and damping, and the material that it presses.
+"""Identification of a device's own mechanics: signs of encoder and motor, friction, damping, and tests of a material.
 
-Loads no JAX.
+Imports no JAX.
 """

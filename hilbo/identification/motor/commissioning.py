@@ -1,9 +1,9 @@
-"""Commissioning: a device with unchecked signs is tested at low energy, homed and measured.
+"""Commissioning of a device: signs of encoder and motor tested at low energy, then homing, delay and damping.
 
-The order is the order of trust. With the motor at rest a person pushes the handle in, which gives the encoder's sign.
-Nudges (DRIVE, shape 3) then give the motor's: a force that ends by itself when the handle has moved, bounded by
-`Bounds`. The first wrong sign ends the commissioning, latches the emergency stop, and nothing pushes again. Only a
-device with both signs right is homed, driven, and measured.
+First a person pushes the handle in with the motor off, which gives the encoder's sign. Nudges (DRIVE, shape 3) then
+give the motor's sign: a force that ends by itself when the handle has moved, limited by `Bounds`. The first wrong sign
+ends the commissioning and latches the emergency stop, and no force is output after it. Only a device with both signs
+right is homed, driven, and measured.
 
 Positions and drives are positive inwards, into the material. Units: mm, N, s, mJ, delay in µs, damping N·s/m.
 """
@@ -31,11 +31,11 @@ __all__ = [
     "rounded_down",
 ]
 
-_FEWEST = 2  # encoder steps of a movement whose direction counts
-_STILL, _REST = 0.3, 10.0  # s without movement before a nudge, and how long to wait for them
-_RAISE = 1.5  # from a force that moves nothing to the next
+_FEWEST = 2  # encoder steps of the smallest movement with a reliable direction
+_STILL, _REST = 0.3, 10.0  # s without movement before a nudge, and timeout for it
+_RAISE = 1.5  # factor from a force that moves nothing to the next
 _BY_HAND = 1.0  # mm
-_PATIENCE = 120.0  # s for a push by hand
+_PUSH_TIMEOUT = 120.0  # s for a push by hand
 _LASTS = 3.0  # s of the drive at 0 N
 _WAITS = 10.0  # s for the heaviest set's history
 _MARGIN, _LEAST_MARGIN, _ROUND = 0.25, 50, 10  # share, µs, µs
@@ -43,27 +43,33 @@ _MARGIN, _LEAST_MARGIN, _ROUND = 0.25, 50, 10  # share, µs, µs
 
 @runtime_checkable
 class Person(Protocol):
-    """The person at the device; each method returns once the person, or a script, has done what was requested."""
+    """Interface to the person at the device; each method returns once the person, or a script, has acted."""
 
     def encoder_checked(self) -> bool:
-        """Whether the encoder is known to count up into the material; else the person is now asked to push it in."""
+        """Return whether the encoder is known to count up into the material.
+
+        If not, ask the person to push the handle in.
+        """
         ...
 
     def take_hands_off(self) -> None:
-        """No hand is on the handle. Raises `InputError` where nobody confirms that."""
+        """Have the person confirm that no hand is on the handle. Raises `InputError` without confirmation."""
         ...
 
     def place(self, moved_mm: float) -> float | None:
-        """Where the handle stands now, mm, after `moved_mm` since the start; None for a device that is homed."""
+        """Return the position of the handle, mm, given `moved_mm` since the start.
+
+        None for a device that is already homed.
+        """
         ...
 
 
 class Bounds(NamedTuple):
-    """What a nudge may be: its first and largest force (N), travel (mm), motor work (mJ), and impulse (N·s).
+    """Limits of a nudge: first and largest force (N), travel (mm), motor work (mJ), and impulse (N·s).
 
-    The device ends a nudge at half of the travel, and the other half is for the force to go: so the motor's work stays
-    below `work_mJ`. A larger force gets less travel and less time: an encoder that does not count is not pushed by
-    more than the impulse.
+    The device ends a nudge at half of the travel; the other half is left for the force to decay, so that the motor's
+    work stays below `work_mJ`. A larger force gets less travel and less time: with an encoder that does not count, the
+    push is limited by the impulse.
     """
 
     first_N: float = 0.3
@@ -77,18 +83,18 @@ class Bounds(NamedTuple):
         return min(self.travel_mm, self.work_mJ / force) / 2
 
     def lasts(self, force: float, device: Renderer) -> float:
-        """Time (s) in which this force (N), which rises at the slew limit, has the impulse; at least a tick."""
+        """Duration (s) for which this force (N), rising at the slew limit, has the impulse; at least one tick."""
         slew = device.device.slew_limit_N_per_s
-        rises = force / (2 * slew)
-        whole = self.impulse_N_s / force
-        seconds = whole + rises if whole >= rises else math.sqrt(2 * self.impulse_N_s / slew)
+        rise_time = force / (2 * slew)
+        duration = self.impulse_N_s / force
+        seconds = duration + rise_time if duration >= rise_time else math.sqrt(2 * self.impulse_N_s / slew)
         return max(math.floor(seconds / device.tick_s + 1e-6), 1) * device.tick_s
 
     def forces(self, device: Renderer) -> list[float]:
-        """Forces (N) to try, rising, for this device's encoder and motor."""
-        bears = min(device.device.force_limit_N, device.condition().continuous_force_N)
-        told_apart = self.work_mJ / (2 * _FEWEST * device.device.encoder_step_mm)
-        most = min(self.most_N, bears, told_apart, self.impulse_N_s / device.tick_s)
+        """Increasing forces (N) to try, within the limits of this device's encoder and motor."""
+        motor_limit = min(device.device.force_limit_N, device.condition().continuous_force_N)
+        detectable = self.work_mJ / (2 * _FEWEST * device.device.encoder_step_mm)
+        most = min(self.most_N, motor_limit, detectable, self.impulse_N_s / device.tick_s)
         forces = [min(self.first_N, most)]
         while forces[-1] < most:
             forces.append(min(_RAISE * forces[-1], most))
@@ -96,7 +102,10 @@ class Bounds(NamedTuple):
 
 
 class Nudge(NamedTuple):
-    """`force_N` has moved the handle by `moved_mm` (both positive inwards), with so much work of the motor (mJ)."""
+    """Result of a nudge with `force_N`: displacement and motor work (mJ).
+
+    Force and displacement are positive inwards.
+    """
 
     force_N: float
     moved_mm: float
@@ -104,7 +113,7 @@ class Nudge(NamedTuple):
 
 
 class Commissioned(NamedTuple):
-    """The nudges that moved the handle, friction, and the longest delay (µs) measured; `notes` for a person."""
+    """Result of a commissioning: nudges that moved the handle, friction, longest delay (µs) measured, and notes."""
 
     nudges: tuple[Nudge, ...]
     friction: Friction
@@ -115,10 +124,10 @@ class Commissioned(NamedTuple):
 def commission(
     device: Renderer, person: Person, say: Callable[[str], None], bounds: Bounds | None = None, seed: int = 0
 ) -> Commissioned:
-    """Signs, homing, delay, friction and damping of a device, in this order.
+    """Check the signs of a device, home it, and measure its delay, friction and damping, in this order.
 
-    Raises `DeviceError` at the first thing that is wrong, and `InputError` where no person has confirmed what only a
-    person can see.
+    `say` receives progress messages. Raises `DeviceError` at the first fault, and `InputError` without the person's
+    confirmation.
     """
     _check_ready(device)
     start_mm = device.status().position_mm
@@ -129,7 +138,7 @@ def commission(
     person.take_hands_off()
     nudges = find_signs(device, say, bounds or Bounds())
     if not device.can & Capability.HOMED_AT_BOOT:
-        _home(device, person, _rests(device) - start_mm)
+        _home(device, person, _position_at_rest(device) - start_mm)
     say("delay")
     notes = _heaviest_set(device)
     drive(device, "force", "hold", 0.0, duration=_LASTS)
@@ -138,7 +147,7 @@ def commission(
 
 
 def _check_ready(device: Renderer) -> None:
-    """Raises `DeviceError` for a device that cannot nudge, is not STOPPED, or is late already."""
+    """Raise `DeviceError` for a device that cannot nudge, is not STOPPED, or has already exceeded its delay."""
     name, status, condition = device.link.name, device.status(), device.condition()
     if not device.can & Capability.DRIVE:
         raise DeviceError(f"{name}: this device cannot move by itself; set HB_CAN_DRIVE in its capabilities.")
@@ -153,7 +162,7 @@ def _check_ready(device: Renderer) -> None:
 
 
 def _check_delay(device: Renderer) -> int:
-    """The longest delay since the device's start, µs. Raises `DeviceError` where it is longer than the device's own."""
+    """Longest delay since the device's start, µs. Raises `DeviceError` if it exceeds the device's configured delay."""
     condition = device.condition()
     longest = condition.longest_delay_us
     if longest > condition.delay_us:
@@ -165,15 +174,15 @@ def _check_delay(device: Renderer) -> int:
 
 
 def _check_encoder(device: Renderer) -> None:
-    """Waits for a push by hand with the motor at rest. Raises `DeviceError` where the position falls by it."""
-    enough = max(_BY_HAND, 4 * device.device.encoder_step_mm)
+    """Wait for a push by hand with the motor off. Raises `DeviceError` if the position decreases."""
+    least_mm = max(_BY_HAND, 4 * device.device.encoder_step_mm)
     before = device.samples(0.02).position_mm[-1]
 
     def pushed() -> float | None:
         moved = device.samples(0.02).position_mm[-1] - before
-        return moved if abs(moved) >= enough else None
+        return moved if abs(moved) >= least_mm else None
 
-    moved = wait_until(device, pushed, f"seen a push by hand of {enough:g} mm", _PATIENCE)
+    moved = wait_until(device, pushed, f"seen a push by hand of {least_mm:g} mm", _PUSH_TIMEOUT)
     if moved < 0:
         device.estop()
         raise DeviceError(
@@ -183,14 +192,19 @@ def _check_encoder(device: Renderer) -> None:
 
 
 def find_signs(device: Renderer, say: Callable[[str], None], bounds: Bounds) -> tuple[Nudge, ...]:
-    """One nudge inwards and one outwards that move the handle. Raises `DeviceError` at the first wrong sign."""
+    """Nudge the handle inwards, then outwards; return the two nudges. Raises `DeviceError` at the first wrong sign."""
     return tuple(_first_that_moves(device, say, bounds, sign) for sign in (1, -1))
 
 
 def _first_that_moves(device: Renderer, say: Callable[[str], None], bounds: Bounds, sign: int) -> Nudge:
-    forces, way = bounds.forces(device), "inwards" if sign > 0 else "outwards"
+    """Nudge in direction `sign` with increasing force until the handle moves.
+
+    Raises `DeviceError` for a movement the other direction, after an emergency stop, and for no movement at the largest
+    force.
+    """
+    forces, side = bounds.forces(device), "inwards" if sign > 0 else "outwards"
     for force in forces:
-        say(f"nudge of {force:.2g} N {way}")
+        say(f"nudge of {force:.2g} N {side}")
         nudge = _nudge(device, sign * force, bounds)
         if abs(nudge.moved_mm) < _FEWEST * device.device.encoder_step_mm:
             continue
@@ -198,51 +212,55 @@ def _first_that_moves(device: Renderer, say: Callable[[str], None], bounds: Boun
             return nudge
         device.estop()
         raise DeviceError(
-            f"{device.link.name}: the motor pushes the wrong way: {force:.2g} N {way} moved the handle by"
+            f"{device.link.name}: the motor pushes the wrong way: {force:.2g} N {side} moved the handle by"
             f" {abs(nudge.moved_mm):.2f} mm the other way; swap the motor's two wires, or change motor_sign in the"
             " device's header, then commission again."
         )
     raise DeviceError(
-        f"{device.link.name}: the handle did not move {way} at up to {forces[-1]:.2g} N; check the motor's supply, the"
+        f"{device.link.name}: the handle did not move {side} at up to {forces[-1]:.2g} N; check the motor's supply, the"
         " amplifier's enable and the encoder's cable, move the handle off its mechanical stop, or allow more with"
         " --most-force."
     )
 
 
 def _nudge(device: Renderer, force: float, bounds: Bounds) -> Nudge:
-    """One nudge from rest. Raises `DeviceError` where the device does not rest before, or is not STOPPED after it."""
+    """Perform one nudge from rest.
+
+    Raises `DeviceError` if the device is not at rest before, or not STOPPED after it.
+    """
     steps = device.device
-    before = _rests(device)
-    reach = max(bounds.reach(abs(force)), _FEWEST * steps.encoder_step_mm)
+    before = _position_at_rest(device)
+    travel = max(bounds.reach(abs(force)), _FEWEST * steps.encoder_step_mm)
     device.samples(0.0)
-    device.drive("force", "nudge", force, reach, duration=bounds.lasts(abs(force), device))
+    device.drive("force", "nudge", force, travel, duration=bounds.lasts(abs(force), device))
     wait_until(device, lambda: device.state() not in (State.DRIVING, State.STOPPING), "ended its nudge")
-    seen, status = device.samples(0.05), device.status()
+    samples, status = device.samples(0.05), device.status()
     if status.state != State.STOPPED:
         raise DeviceError(
             f"{device.link.name}: a nudge of {force:.2g} N ended in {meaning(State, status.state)}:"
             f" {held_because(status.hold_reason)}; find out why, then commission again."
         )
-    driving = np.flatnonzero(seen.flags & SampleFlag.DRIVING)
+    driving = np.flatnonzero(samples.flags & SampleFlag.DRIVING)
     if not driving.size:
         raise DeviceError(f"{device.link.name}: no telemetry of the nudge has come; check the line, then try again.")
-    moved = seen.position_mm[driving[0] :] - before
-    work = -np.sum(seen.force_N[:-1] * np.diff(seen.position_mm))  # force_N is positive outwards
+    moved = samples.position_mm[driving[0] :] - before
+    work = -np.sum(samples.force_N[:-1] * np.diff(samples.position_mm))  # force_N is positive outwards
     return Nudge(force, float(moved[np.argmax(np.abs(moved))]), float(work))
 
 
-def _rests(device: Renderer) -> float:
-    """The position (mm) of a handle that has not moved for a while. Raises `DeviceError` where it goes on moving."""
+def _position_at_rest(device: Renderer) -> float:
+    """Wait until the handle is at rest and return its position (mm). Raises `DeviceError` if it keeps moving."""
     step = device.device.encoder_step_mm
 
     def position() -> tuple[float] | None:
-        seen = device.samples(_STILL).position_mm[-max(2, round(_STILL / device.tick_s / device.divisor)) :]
-        return (float(seen[-1]),) if np.ptp(seen) <= 1.01 * step else None
+        recent = device.samples(_STILL).position_mm[-max(2, round(_STILL / device.tick_s / device.divisor)) :]
+        return (float(recent[-1]),) if np.ptp(recent) <= 1.01 * step else None
 
     return wait_until(device, position, "come to rest by itself with its motor at rest", _REST)[0]
 
 
 def _home(device: Renderer, person: Person, moved_mm: float) -> None:
+    """Home the device at the position given by the person, if it is not homed already."""
     position = person.place(moved_mm)
     if position is not None:
         device.home(position)
@@ -250,7 +268,10 @@ def _home(device: Renderer, person: Person, moved_mm: float) -> None:
 
 
 def _heaviest_set(device: Renderer) -> list[str]:
-    """Put a soft set with the longest memory in force, so that ticks take as long as they can; a note where none is."""
+    """Put a soft set with the longest memory in force, to maximise the computing time of a tick.
+
+    Returns a note if the device refuses the set.
+    """
     low = {name: ends[0] for name, ends in device.limits().items()}
     taps = device.device.most_taps - (device.device.most_taps + 1) % 2
     K1, B1, alpha = max(low["K1"], 1e-3), max(low["B1"], 1e-3), max(low["alpha"], 0.2)
@@ -262,7 +283,7 @@ def _heaviest_set(device: Renderer) -> list[str]:
 
 
 def _longest_delay(device: Renderer) -> int:
-    """The longest delay since the device's start, µs. Raises `DeviceError` for a device that measures none."""
+    """Longest delay since the device's start, µs. Raises `DeviceError` for hardware that reports 0."""
     longest = _check_delay(device)
     if longest == 0 and not device.can & Capability.SIMULATED:
         raise DeviceError(
@@ -273,7 +294,7 @@ def _longest_delay(device: Renderer) -> int:
 
 
 def delay_for(longest_us: int) -> int:
-    """`delay_us` for a header: the longest that was measured and a quarter, 50 µs at least, rounded up to 10."""
+    """`delay_us` for a config header: measured delay plus 25 %, at least plus 50 µs, rounded up to a multiple of 10."""
     return _ROUND * math.ceil((longest_us + max(_MARGIN * longest_us, _LEAST_MARGIN)) / _ROUND)
 
 

@@ -1,6 +1,6 @@
-"""What a device can be asked to do without a hand: test its line, measure its own damping, press a material.
+"""Automatic tests of a device: self-test of the line, measurement of its damping, and tests of a material.
 
-Everything is timed in ticks of the device. Drives are positive inwards, towards the material, and so is `sensed_N`;
+Time is counted in ticks of the device. Drives are positive inwards, towards the material, and so is `sensed_N`;
 `force_N` is positive outwards (firmware/PROTOCOL.md, "Signs"). Units: mm, N, s.
 """
 
@@ -18,16 +18,16 @@ from hilbo.identification.motor.pressing import Pressed, pressed, table_of
 
 __all__ = ["CutShortError", "SelfTest", "characterise", "drive", "measure_damping", "selftest", "wait_until"]
 
-_SWEEPS = 24  # there and back
+_SWEEPS = 24  # back-and-forth sweeps
 _SLOWEST, _FASTEST = 10.0, 55.0  # mm/s
 _SETTLE = 0.12  # s after each turn
-_SPREAD = 0.01  # of depth and loads, from the least to the most
-_FREE = 0.1  # N that a free device's sensor may show
-_MOST = 2.0  # s for what the device does at once
+_SPREAD = 0.01  # relative range of depth and loads over the repeats
+_FREE = 0.1  # N, largest mean sensor force without contact
+_TIMEOUT = 2.0  # s, timeout for immediate actions
 
 
 class CutShortError(DeviceError):
-    """A measurement ended before its time; `table` holds the `repeats` that were whole by then."""
+    """A measurement ended early; `table` has the data of the `repeats` that were complete."""
 
     def __init__(self, words: str, table: Any, repeats: int):
         super().__init__(words)
@@ -35,10 +35,12 @@ class CutShortError(DeviceError):
 
 
 class SelfTest(NamedTuple):
-    """`echoes` came back whole of `asked`; round trip in ms; `watchdog_ticks` from the last heartbeat to HOLD.
+    """Results of the self-test.
 
-    `delay_us` is the longest time from when a tick was due until its force was out, as the device has measured it, and
-    `delay_limit_us` the delay for which it checks sets.
+    `echoes` of `asked` loopback messages returned intact; round trip in ms (median, 99th percentile); `watchdog_ticks`
+    from the last heartbeat to HOLD, `watchdog_limit` the configured value; `force_after_N`: force after the ramp.
+    `delay_us`: longest time from when a tick was due until its force was output, measured by the device;
+    `delay_limit_us`: the delay for which it checks sets.
     """
 
     asked: int
@@ -54,8 +56,11 @@ class SelfTest(NamedTuple):
     delay_limit_us: int
 
 
-def wait_until(device: Renderer, done: Callable[[], Any], what: str, seconds: float = _MOST) -> Any:
-    """The first true value of `done`. Raises `DeviceError` when `what` has not come after `seconds`."""
+def wait_until(device: Renderer, done: Callable[[], Any], what: str, seconds: float = _TIMEOUT) -> Any:
+    """Poll `done` until its value is true and return it. Raises `DeviceError` after `seconds`.
+
+    `what` completes its sentence.
+    """
     give_up = device.link.now() + seconds
     while not (value := done()):
         if device.link.now() > give_up:
@@ -65,57 +70,60 @@ def wait_until(device: Renderer, done: Callable[[], Any], what: str, seconds: fl
 
 
 def drive(device: Renderer, mode: Any, shape: Any, offset: float, amplitude: float = 0.0, **times: Any) -> Samples:
-    """Let the device move by itself, and return the samples of it. Raises `DeviceError` if it does not finish."""
+    """Perform a drive (a motion of the device by itself) and return its samples.
+
+    Raises `DeviceError` if it ends early.
+    """
     device.samples(0.0)
     device.drive(mode, shape, offset, amplitude, **times)
     begun, arrived = device.status().tick, [device.samples(times["duration"])]
     while not _ended(arrived[-1], begun):
         arrived.append(device.samples(0.05))
     wait_until(device, lambda: device.state() != State.STOPPING, "stopped")
-    whole = joined(arrived)
-    driving = (whole.flags & SampleFlag.DRIVING) != 0
+    samples = joined(arrived)
+    driving = (samples.flags & SampleFlag.DRIVING) != 0
     if driving.sum() * device.divisor < round(times["duration"] / device.tick_s) - device.divisor:
         status = device.status()
         raise DeviceError(
             f"The device has ended its drive early, now {meaning(State, status.state)}:"
             f" {held_because(status.hold_reason)}; nothing of it is used."
         )
-    return Samples(*(column[driving] for column in whole))
+    return Samples(*(column[driving] for column in samples))
 
 
-def _ended(seen: Samples, begun: int) -> bool:
-    """Whether the last sample comes after a drive that had begun at the tick `begun`, of 32 bits, or one later."""
-    if seen.flags.size == 0 or seen.flags[-1] & SampleFlag.DRIVING:
+def _ended(samples: Samples, begun: int) -> bool:
+    """Whether the last sample comes after the drive that began at or just after the tick `begun` (modulo 2^32)."""
+    if samples.flags.size == 0 or samples.flags[-1] & SampleFlag.DRIVING:
         return False
-    return 2 < (int(seen.tick[-1]) - begun) % 2**32 < 2**31
+    return 2 < (int(samples.tick[-1]) - begun) % 2**32 < 2**31
 
 
 def measure_damping(device: Renderer, say: Callable[[str], None], seed: int = 0) -> Friction:
-    """Damping b, Coulomb friction and mass of the free device, by sweeps through its stroke at several speeds.
+    """Measure damping, Coulomb friction and mass of the free device by triangular sweeps at 24 speeds.
 
-    Nothing may touch the handle. Raises `InputError` where the stroke is too short, `DeviceError` where something
-    touches it, and where the line does not carry every tick: forces seen now and then say nothing of their mean.
+    Nothing may touch the handle. Raises `InputError` if the stroke is too short, `DeviceError` if something touches the
+    handle, and if the line does not carry every tick, since the mean force needs all of them.
     """
     if device.divisor > 1:
         raise DeviceError(
             f"{device.link.name}: the line carries every {device.divisor}th tick, and damping needs all of them; use a"
             " faster line (--baud, and the device's own rate)."
         )
-    about, rng = device.device, np.random.default_rng(seed)
-    low, high = about.position_low_mm, about.position_high_mm
-    middle, most, stretches = (low + high) / 2, 0.3 * (high - low), []
-    fastest = min(_FASTEST, 0.2 * about.velocity_limit_mm_per_s, 0.7 * most / _SETTLE)
-    # No two periods alike: what encoder and servo do wrong at one speed, they do again at the same speed.
+    limits, rng = device.device, np.random.default_rng(seed)
+    low, high = limits.position_low_mm, limits.position_high_mm
+    middle, most, measured = (low + high) / 2, 0.3 * (high - low), []
+    fastest = min(_FASTEST, 0.2 * limits.velocity_limit_mm_per_s, 0.7 * most / _SETTLE)
+    # All periods differ, since errors of encoder and servo recur at equal speed.
     for count, speed in enumerate(rng.permutation(np.geomspace(min(_SLOWEST, fastest / 4), fastest, _SWEEPS))):
         say(f"sweep {count + 1} of {_SWEEPS}: {speed:.0f} mm/s")
         reach = most * rng.uniform(0.8, 1.0)
         period = round(4 * reach / speed, 3)
-        seen = drive(device, "position", "triangle", middle, reach, period=period, duration=1.25 * period + 0.02)
-        if np.mean(np.abs(seen.sensed_N)) > _FREE:  # false without a sensor
+        samples = drive(device, "position", "triangle", middle, reach, period=period, duration=1.25 * period + 0.02)
+        if np.mean(np.abs(samples.sensed_N)) > _FREE:  # false without a sensor
             raise DeviceError("Something touches the handle; take it away, damping is measured on the free device.")
         tick = device.tick_s * device.divisor
-        stretches += sweeps(seen.position_mm, -seen.force_N, tick, period, _SETTLE, count)
-    return friction(stretches, seed)
+        measured += sweeps(samples.position_mm, -samples.force_N, tick, period, _SETTLE, count)
+    return friction(measured, seed)
 
 
 def characterise(
@@ -130,17 +138,17 @@ def characterise(
     rest: float = 2.0,
     seed: int = 0,
 ) -> Any:
-    """The paper's relaxation (`depth` mm held) and creep (`force` N, then `after` N) of the material at position 0.
+    """Run the paper's relaxation (`depth` mm held) and creep (`force` N, then `after` N) on the material at position 0.
 
     Returns the table that `hilbo identify` reads: test, repeat, time_s, position_mm, force_N. Each test begins off the
-    material and at rest; `rest` s between them let it recover. Depth and loads differ by up to half a per cent from
+    material and at rest; between tests it recovers for `rest` s. Depth and loads vary by up to half a per cent from
     repeat to repeat, so that the encoder's rounding averages out. Raises `InputError` and `DeviceError`, which is
-    `CutShortError` once a repeat is whole.
+    `CutShortError` once a repeat is complete.
     """
     step, low = device.device.encoder_step_mm, device.device.position_low_mm
     if not (repeats >= 1 and depth > 0 and force > 0 and hold > 0 and rest > 0):  # nor is any of them NaN
         raise InputError("Repeats, depth, force, hold and rest must be above 0.")
-    away = max(low / 2, -1.0)
+    off_material = max(low / 2, -1.0)
     spread = 1 + _SPREAD * (np.random.default_rng(seed).permutation(repeats) + 0.5 - repeats / 2) / repeats
     last = {"relaxation": hold, "creep": 2 * hold}
     presses: dict[str, list[Pressed]] = {"relaxation": [], "creep": []}
@@ -148,49 +156,49 @@ def characterise(
     try:
         for repeat, scale in enumerate(spread, 1):
             say(f"relaxation {repeat} of {repeats}")
-            way = "position", "hold", depth * scale
-            relaxation = _pressed(device, "relaxation", away, rest, *way, duration=hold + 0.5)
+            drive_kind = "position", "hold", depth * scale
+            relaxation = _pressed(device, "relaxation", off_material, rest, *drive_kind, duration=hold + 0.5)
             say(f"creep {repeat} of {repeats}")
-            way = "force", "step", force * scale, after * scale
-            creep = _pressed(device, "creep", -step, rest, *way, period=hold, duration=2 * hold + 0.1)
+            drive_kind = "force", "step", force * scale, after * scale
+            creep = _pressed(device, "creep", -step, rest, *drive_kind, period=hold, duration=2 * hold + 0.1)
             presses["relaxation"].append(relaxation)
             presses["creep"].append(creep)
-        drive(device, "position", "hold", away, duration=0.5)
+        drive(device, "position", "hold", off_material, duration=0.5)
     except (DeviceError, KeyboardInterrupt) as error:
-        whole = len(presses["creep"])
-        if not whole:
+        complete = len(presses["creep"])
+        if not complete:
             raise
         words = str(error) or "It was ended from the keyboard."
-        raise CutShortError(words, table_of(presses, last, device.tick_s * device.divisor), whole) from error
+        raise CutShortError(words, table_of(presses, last, device.tick_s * device.divisor), complete) from error
     return table_of(presses, last, device.tick_s * device.divisor)
 
 
-def _pressed(device: Renderer, kind: str, before: float, rest: float, *way: Any, **times: float) -> Pressed:
-    """One test, driven in this `way`, after `rest` s at the position `before` (mm)."""
+def _pressed(device: Renderer, kind: str, before: float, rest: float, *motion: Any, **times: float) -> Pressed:
+    """Run one test with the drive `motion`, after `rest` s at the position `before` (mm)."""
     free = drive(device, "position", "hold", before, duration=rest)
-    return pressed(drive(device, *way, **times), kind, bool(device.can & Capability.FORCE_SENSOR), _noise(free))
+    return pressed(drive(device, *motion, **times), kind, bool(device.can & Capability.FORCE_SENSOR), _noise(free))
 
 
 def _noise(free: Samples) -> float:
-    """Standard deviation of the sensor's force (N) off the material; 0 without one."""
+    """Standard deviation of the sensor's force (N) off the material; 0 without a sensor."""
     off = free.sensed_N[free.position_mm <= 0]
     return float(np.std(off[off.size // 2 :])) if off.size and not np.isnan(off).any() else 0.0
 
 
 def selftest(device: Renderer, say: Callable[[str], None], echoes: int = 300) -> SelfTest:
-    """Loopback of every byte and length, round trips, and whether silence stops the device in time."""
+    """Test the loopback of every byte and length, the round-trip time, and the watchdog of a device."""
     say("loopback")
-    rng, whole = np.random.default_rng(0), 0
+    rng, intact = np.random.default_rng(0), 0
     device.link.round_trips.clear()
     for n in range(echoes):
         sent = bytes(range(4 * (n % 65), 4 * (n % 65) + n % 65 % 4)) if n < 65 else rng.bytes(n % 65)
-        whole += device.echo(sent) == sent
+        intact += device.echo(sent) == sent
     times = np.array(device.link.round_trips) * 1e3
     say("watchdog")
     ticks, force = _watchdog(device)
     return SelfTest(
         echoes,
-        whole,
+        intact,
         float(np.median(times)),
         float(np.quantile(times, 0.99)),
         device.link.retries,
@@ -204,7 +212,7 @@ def selftest(device: Renderer, say: Callable[[str], None], echoes: int = 300) ->
 
 
 def _watchdog(device: Renderer) -> tuple[int, float]:
-    """Ticks from the last heartbeat that the device can have heard to its HOLD, and the force (N) after the ramp."""
+    """Test the watchdog: ticks from the last heartbeat to HOLD, and the force (N) after the ramp."""
     if not device.can & Capability.DRIVE:
         raise InputError(
             "This device cannot move by itself, and its watchdog is not tested; start a set, then pull the plug."

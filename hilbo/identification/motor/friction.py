@@ -1,16 +1,15 @@
-"""Damping and Coulomb friction of a free device, from sweeps at several speeds.
+"""Damping and Coulomb friction of a free device, estimated from sweeps at several speeds.
 
-While the handle moves one way, Newton's law m·x'' + b·x' + c·sign(x') + f0 = F holds for its position x and the
-motor's force F along it: mass, damping, Coulomb friction, a constant force such as weight. Weighted by
-w(t) = sin²(π t/L) over a stretch of length L, which vanishes with its slope at both ends, and integrated by parts,
+While the handle moves in one direction, Newton's law m·x'' + b·x' + c·sign(x') + f0 = F holds for its position x and
+the motor's force F along it: mass, damping, Coulomb friction, a constant force such as weight. Weighted by w(t) =
+sin²(π t/L) over an interval of length L, which vanishes with its slope at both ends, and integrated by parts,
 
     ∫wF = m·∫w''x - b·∫w'x + c·sign·∫w + f0·∫w,
 
-which is linear in what is sought and differentiates no encoder (Shinbrot 1954). Where the residuals refute this law,
-one with a further term takes its place, or none (`friction_laws`). Least squares over the stretches;
-intervals by a bootstrap over whole periods, there and back, because what is wrong in one sweep, cogging or a servo that
-swings, is wrong in the next in the same way (Künsch 1989).
-Units: mm, N, s, b in N·s/m, m in kg.
+which is linear in the parameters and does not differentiate the encoder signal (Shinbrot 1954). If the residuals reject
+this law, one with an additional term is used, or none (`friction_laws`). Least squares over the sweeps; intervals by a
+bootstrap over whole periods, there and back, because errors of one sweep (cogging, servo oscillation) recur in the next
+(block bootstrap, Künsch 1989). Units: mm, N, s, b in N·s/m, m in kg.
 """
 
 from collections.abc import Sequence
@@ -27,12 +26,12 @@ __all__ = ["Friction", "Interval", "Sweep", "friction", "sweeps"]
 
 _FEWEST = 8  # periods
 _DRAWS = 4000
-_AS_WELL = 1.25  # times the least sum of squares: laws that the sweeps hardly tell apart
-_CREEPS = 0.008  # s after a turn, until the handle surely moves
+_AS_WELL = 1.25  # times the least sum of squares, up to which a law fits about as well
+_CREEPS = 0.008  # s after a turn until the handle moves
 
 
 class Sweep(NamedTuple):
-    """Means, weighted by w, of one stretch: force (N), velocity (mm/s), acceleration (mm/s²); and its period."""
+    """Weighted means over one sweep: force (N), velocity (mm/s), acceleration (mm/s²); and the number of its period."""
 
     force: float
     velocity: float
@@ -41,7 +40,7 @@ class Sweep(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """An estimate and its 95 % interval."""
+    """Estimate with its 95 % interval."""
 
     value: float
     lower: float
@@ -49,10 +48,10 @@ class Interval(NamedTuple):
 
 
 class Friction(NamedTuple):
-    """The friction of a free device; `residual` (N) is the standard deviation of the residuals of the sweeps.
+    """Friction of a free device; `residual` (N) is the standard deviation of the residuals of the sweeps.
 
-    `law` is one of `friction_laws.LAWS`, `added` the further term of the second (N·s²/m²) or third (N), whose v_s is
-    `speed` (mm/s). The interval of the damping holds those of all laws that fit about as well.
+    `law` is one of `friction_laws.LAWS`, `added` the additional term of the second (N·s²/m²) or third (N), whose v_s is
+    `speed` (mm/s). The interval of the damping covers those of all laws that fit about as well.
     """
 
     damping: Interval  # N·s/m
@@ -75,44 +74,51 @@ def sweeps(
     settle: float,
     number: int = 0,
 ) -> list[Sweep]:
-    """The sweeps of a triangle that begins at its middle and rises; `period` and `settle` in s.
+    """Split the record of a triangular drive, which starts at its middle and rises, into sweeps.
 
-    Each way is two sweeps: `settle` after the turn, where the servo swings and the mass shows, and the rest. `force`
-    (N) is the motor's, along the position (mm); samples every `tick` s. `number` is that of the first period, so
-    that recordings can be joined.
+    `period` and `settle` in s.
+
+    Each direction gives two sweeps: the `settle` s after the turn, where the servo oscillates and the mass matters, and
+    the rest. `force` (N) is the motor's, along the position (mm); samples every `tick` s. `number`: number of the first
+    period, to join several records. Raises `InputError` for sweeps shorter than twice `settle`.
     """
     half, skip = round(period / 2 / tick), round(settle / tick)
     recorded, starts = [], range(round(period / 4 / tick), position.size - half + 1, half)  # where the triangle turns
     if half < 2 * skip:
         raise InputError(f"The sweeps are too short: {half * tick:.3g} s, and the first {settle:.3g} s are the turn.")
     for count, start in enumerate(starts):
-        way = position[start : start + half]
-        # The handle turns later than the triangle, and rests there for as long as friction holds it.
-        rests = np.flatnonzero(way == (way.max() if way[0] > way[-1] else way.min()))
-        turn = start + int(rests[-1]) + round(_CREEPS / tick)
+        half_period = position[start : start + half]
+        # The handle turns later than the triangle, and at_turn there for as long as friction holds it.
+        at_turn = np.flatnonzero(
+            half_period == (half_period.max() if half_period[0] > half_period[-1] else half_period.min())
+        )
+        turn = start + int(at_turn[-1]) + round(_CREEPS / tick)
         for first, end in ((turn, turn + skip), (turn + skip, start + half)):
             recorded.append(_sweep(position[first:end], force[first:end], tick, number + count // 2))
     return recorded
 
 
 def _sweep(x: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], tick: float, period: int) -> Sweep:
-    """The integrals over ∫w = L/2; a force is held from its sample to the next."""
+    """Weighted means of one sweep of positions `x` (mm) and forces (N).
+
+    A force is constant from its sample to the next.
+    """
     turns = 2 * np.pi * np.arange(x.size) / (x.size - 1)
-    length, held = (x.size - 1) * tick, (turns[:-1] + turns[1:]) / 2
-    # w = (1 - cos)/2. x may be counted from anywhere in w'' and w', whose integrals are 0: the smaller the better.
+    length, mid_turns = (x.size - 1) * tick, (turns[:-1] + turns[1:]) / 2
+    # w = (1 - cos)/2. The origin of x is arbitrary, since w'' and w' have integral 0; centred for precision.
     x = x - x.mean()
-    mean_force = np.sum((1 - np.cos(held)) * force[:-1]) * tick / length
+    mean_force = np.sum((1 - np.cos(mid_turns)) * force[:-1]) * tick / length
     ends = (x[0] + x[-1]) / 2  # the trapezoid rule, for w'' that does not vanish there
-    bend = np.sum(np.cos(turns) * x) - ends
+    curvature = np.sum(np.cos(turns) * x) - ends
     velocity = -(2 * np.pi / length**2) * tick * np.sum(np.sin(turns) * x)
-    acceleration = (2 * np.pi / length) ** 2 * tick / length * bend
+    acceleration = (2 * np.pi / length) ** 2 * tick / length * curvature
     return Sweep(float(mean_force), float(velocity), float(acceleration), period)
 
 
 def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
-    """Least squares over the sweeps by the simplest law that fits, with intervals by a bootstrap over periods.
+    """Estimate friction by least squares over the sweeps, by the simplest law that fits.
 
-    Raises `InputError` for too few sweeps, `DeviceError` where no law fits them.
+    Intervals by bootstrap over periods.
     """
     values = np.array([[s.force, s.velocity, s.acceleration] for s in sweeps])
     periods, period = np.unique([s.period for s in sweeps], return_inverse=True)
@@ -130,13 +136,17 @@ def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
         again = _intervals(other, seed)[1]
         damping = Interval(damping.value, min(damping.lower, again.lower), max(damping.upper, again.upper))
     freedom = blocks.terms.shape[1]
-    residual, further = float(blocks.left.std(ddof=freedom)), added[0] if added else None
+    residual, added_term = float(blocks.left.std(ddof=freedom)), added[0] if added else None
     parts = damping, coulomb, mass, constant
-    return Friction(*parts, residual, len(sweeps), int(periods.size), law.name, further, law.speed)
+    return Friction(*parts, residual, len(sweeps), int(periods.size), law.name, added_term, law.speed)
 
 
 def _fitting(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> list[tuple[Law, Blocks]]:
-    """The law that fits and its terms, then those that fit about as well. Raises `DeviceError` where none does."""
+    """Laws that fit the sweeps, simplest first, each with its least-squares problem.
+
+    Only the simplest law if it is not rejected; else those within 1.25 times the least sum of squares. `way`:
+    direction, 1 or -1. Raises `DeviceError` if every law is rejected.
+    """
     simplest, *others = candidates(speed, way)
     if not refuted(blocks, speed, way):
         return [(simplest, blocks)]
@@ -154,7 +164,7 @@ def _fitting(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarr
 
 
 def _intervals(blocks: Blocks, seed: int) -> list[Interval]:
-    """Estimates of all terms, with a bootstrap over periods."""
+    """Estimates of all terms with basic bootstrap intervals over periods."""
     count, best = int(blocks.period.max()) + 1, blocks.best
     products = blocks.terms[:, :, None] * blocks.terms[:, None, :]
     sums = np.zeros((count, *products.shape[1:])), np.zeros((count, best.size))
@@ -163,7 +173,7 @@ def _intervals(blocks: Blocks, seed: int) -> list[Interval]:
     drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), _DRAWS)
     normal, right = np.tensordot(drawn, sums[0], 1), drawn @ sums[1]
     estimates = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
-    # Basic bootstrap, widened for the few blocks as a t-interval is: the errors' distribution turned over.
+    # Basic bootstrap, widened for the small number of blocks as a t-interval is.
     wide = np.sqrt(count / (count - best.size))
     lower, upper = best - wide * (np.quantile(estimates, [0.975, 0.025], axis=0) - best)
     return [Interval(*map(float, row)) for row in zip(best, lower, upper, strict=True)]

@@ -1,13 +1,12 @@
-"""Which law the friction of a free device follows: terms in the speed v that are added to damping and Coulomb friction.
+"""Friction laws of a free device: terms in the speed v in addition to damping and Coulomb friction.
 
     viscous + Coulomb              b·v + c
     viscous + Coulomb + quadratic  b·v + c + d·v²                    drag, a motor's losses
     viscous + Coulomb + Stribeck   b·v + c + s·exp(-(v/v_s)^δ)       a lubricated contact; δ is 1 or 2
 
-Fitted by the first, a device of the second kind seems to have more damping than it has at the speeds of a hand, which
-is the unsafe side: passivity rests on b. A law is *refuted* where a term that it lacks is not 0: by a Wald test over
-periods, whose sweeps err alike. The terms that are tried on every law are two that bend freely with
-the logarithm of the speed.
+If a device of the second kind is fitted by the first law, its damping is overestimated at the speeds of a hand, which
+is unsafe: passivity depends on b. A law is *refuted* if additional terms are significant by a Wald test that is
+clustered by period. The additional terms are two that are quadratic and cubic in the logarithm of the speed.
 """
 
 from collections.abc import Iterator
@@ -18,13 +17,13 @@ from jaxtyping import Float
 
 __all__ = ["LAWS", "Blocks", "Law", "candidates", "refuted"]
 
-_LEVEL = 0.002  # probability to refute a law that holds
-_SPEEDS = np.geomspace(4.0, 60.0, 9)  # v_s that are tried, mm/s
+_LEVEL = 0.002  # significance level of the test of a law
+_SPEEDS = np.geomspace(4.0, 60.0, 9)  # candidate v_s, mm/s
 LAWS = ("viscous + Coulomb", "viscous + Coulomb + quadratic", "viscous + Coulomb + Stribeck")
 
 
 class Law(NamedTuple):
-    """A law: its name, the term (n,) that it adds for each sweep, None for the first, and the term's v_s (mm/s)."""
+    """Friction law: name, term (n,) that it adds for each sweep (None for the first law), and v_s (mm/s) of that."""
 
     name: str
     term: Float[np.ndarray, " n"] | None
@@ -32,19 +31,19 @@ class Law(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """Least squares of `force` (n,) on `terms` (n, p), whose errors are alike within a `period` (n,), 0 … P-1."""
+    """Least-squares problem of `force` (n,) on `terms` (n, p); errors correlate within a `period` (n,), 0 … P-1."""
 
     terms: Float[np.ndarray, "n p"]
     force: Float[np.ndarray, " n"]
     period: np.ndarray
 
     def with_term(self, law: Law) -> "Blocks":
-        """The same with the further term of a law."""
+        """Copy with the additional term of a law."""
         return self if law.term is None else self._replace(terms=np.column_stack([self.terms, law.term]))
 
     @property
     def best(self) -> Float[np.ndarray, " p"]:
-        """The estimate. (p,)."""
+        """Least-squares estimate. (p,)."""
         return np.linalg.lstsq(self.terms, self.force, rcond=None)[0]
 
     @property
@@ -53,16 +52,19 @@ class Blocks(NamedTuple):
         return self.force - self.terms @ self.best
 
     def covariance(self) -> Float[np.ndarray, "p p"]:
-        """Of the estimate: a sandwich over periods, for few of them (Bell & McCaffrey's CR2 to first order). (p, p)."""
+        """Cluster-robust covariance of the estimate by period, corrected for few clusters (CR2 to first order).
+
+        (p, p).
+        """
         count, free = self.period.max() + 1, self.terms.shape[1]
-        pulls = np.zeros((count, free))
-        np.add.at(pulls, self.period, self.terms * self.left[:, None])
+        scores = np.zeros((count, free))
+        np.add.at(scores, self.period, self.terms * self.left[:, None])
         bread = np.linalg.inv(self.terms.T @ self.terms)
-        return count / (count - free) * bread @ pulls.T @ pulls @ bread
+        return count / (count - free) * bread @ scores.T @ scores @ bread
 
 
 def candidates(speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> Iterator[Law]:
-    """The laws for sweeps with a `speed` (mm/s) in the direction `way` (1 or -1), simplest first."""
+    """Yield the candidate laws for sweeps with a `speed` (mm/s) in the direction `way` (1 or -1), simplest first."""
     yield Law(LAWS[0], None)
     yield Law(LAWS[1], way * (speed / 1e3) ** 2)
     for sharpness in (1, 2):
@@ -71,15 +73,15 @@ def candidates(speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> 
 
 
 def refuted(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> bool:
-    """Whether two terms that bend freely with the logarithm of the speed (mm/s) improve on a law."""
-    height = np.log(speed / np.median(speed))
-    free = way[:, None] * np.stack([height**2, height**3], axis=1)
-    more = blocks._replace(terms=np.hstack([blocks.terms, free]))
-    return wald(more, free.shape[1]) < _LEVEL
+    """Whether terms quadratic and cubic in the logarithm of the speed (mm/s) are significant on top of a law."""
+    log_speed = np.log(speed / np.median(speed))
+    free = way[:, None] * np.stack([log_speed**2, log_speed**3], axis=1)
+    extended = blocks._replace(terms=np.hstack([blocks.terms, free]))
+    return wald(extended, free.shape[1]) < _LEVEL
 
 
 def wald(blocks: Blocks, last: int) -> float:
-    """Probability of so large a value of the `last` terms if they are 0."""
+    """p value of the Wald test that the `last` terms are 0."""
     from scipy.stats import f as fisher
 
     count, free = int(blocks.period.max()) + 1, blocks.terms.shape[1]

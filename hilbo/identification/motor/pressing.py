@@ -1,10 +1,9 @@
-"""From samples of a device that presses a material to the table of tests that `hilbo identify` reads.
+"""Conversion of samples of a device that presses a material to the table of tests that `hilbo identify` reads.
 
-A test begins with the last sample off the material. When a light load follows a heavy one, the handle's mass may
-carry it off the material for some milliseconds: the material's force is then 0, and the handle's position is not its
-surface's. Those rows are left out, but for two at either end, the inner ones of which have force 0, so that the force
-between them is read as the 0 that it was.
-Units: mm, N, s; positions and forces are positive into the material.
+A test begins with the last sample off the material. When a light load follows a heavy one, the handle's mass may carry
+it off the material for some milliseconds: the material's force is then 0, and the handle's position is not that of its
+surface. Those rows are left out except two at either end, the inner ones of which have force 0, so that interpolation
+of the force gives 0 between them. Units: mm, N, s; positions and forces are positive into the material.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,14 +17,17 @@ from hilbo.device.telemetry import Samples
 
 __all__ = ["Pressed", "pressed", "table_of"]
 
-_NOTHING = 0.05  # mm; a test that goes no deeper has met nothing
-_LEAST = 5e-3  # N; less than this is no contact, whatever the sensor's noise
+_NOTHING = 0.05  # mm; a test that stays shallower has had no contact
+_LEAST = 5e-3  # N; least force that counts as contact
 _SURE = 4.0  # standard deviations
-_STAY = 5  # samples
+_STAY = 5  # samples, shortest loss of contact
 
 
 class Pressed(NamedTuple):
-    """One test, from the last sample off the material on; `off` marks samples at which the handle had left it again."""
+    """One test, from the last sample off the material on.
+
+    `off` marks samples without contact after the first contact.
+    """
 
     position: Float[np.ndarray, " n"]
     force: Float[np.ndarray, " n"]
@@ -33,9 +35,11 @@ class Pressed(NamedTuple):
 
 
 def pressed(seen: Samples, kind: str, sensed: bool, noise: float) -> Pressed:
-    """One test. Its force is the sensor's, whose `noise` (N) is known, or without one the motor's.
+    """Cut one test out of the samples.
 
-    Raises `DeviceError` where nothing was met at position 0.
+    Its force is the sensor's with noise `noise` (N), or without a sensor the motor's.
+
+    Raises `DeviceError` if there was no contact at position 0.
     """
     inside = np.flatnonzero(seen.position_mm > 0)
     if inside.size == 0 or seen.position_mm.max() < _NOTHING:
@@ -43,15 +47,15 @@ def pressed(seen: Samples, kind: str, sensed: bool, noise: float) -> Pressed:
     first = max(int(inside[0]) - 1, 0)
     position = np.maximum(seen.position_mm[first:], 0.0)
     force = -(seen.sensed_N if sensed else seen.force_N)[first:]
-    off = _left(force, noise) if sensed else np.zeros(force.size, bool)
+    off = _contact_lost(force, noise) if sensed else np.zeros(force.size, bool)
     return Pressed(position, np.where((position > 0) & ~off, force, 0.0), off)
 
 
-def _left(force: Float[np.ndarray, " n"], noise: float) -> Bool[np.ndarray, " n"]:
-    """Samples without contact, in stays of `_STAY` or more, after the force was first felt."""
+def _contact_lost(force: Float[np.ndarray, " n"], noise: float) -> Bool[np.ndarray, " n"]:
+    """Samples without contact after the first contact, in runs of `_STAY` or more."""
     smooth = np.convolve(force, np.ones(_STAY) / _STAY, "same")
     off = smooth < max(_SURE * noise / np.sqrt(_STAY), _LEAST)
-    edges = np.flatnonzero(np.diff(off, prepend=True, append=False))  # begins and ends of what is felt and not felt
+    edges = np.flatnonzero(np.diff(off, prepend=True, append=False))  # starts and ends of contact
     for first, end in zip(edges[1::2], edges[2::2], strict=False):
         off[first:end] = end - first >= _STAY
     off[: edges[0]] = False
@@ -59,24 +63,27 @@ def _left(force: Float[np.ndarray, " n"], noise: float) -> Bool[np.ndarray, " n"
 
 
 def table_of(tests: Mapping[str, Sequence[Pressed]], last: Mapping[str, float], tick: float) -> Any:
-    """The table: test, repeat, time_s, position_mm, force_N; the repeats of a test have the same times."""
+    """Table of the tests: test, repeat, time_s, position_mm, force_N; the repeats of a test share their times.
+
+    `last`: duration (s) of each kind of test; `tick` in s.
+    """
     import pandas as pd
 
     parts = []
     for kind, repeats in tests.items():
-        size = min(min(one.position.size for one in repeats), round(last[kind] / tick) + 1)
-        off = np.any([one.off[:size] for one in repeats], axis=0)
-        silent, kept = _within(off), ~_within(_within(off))
+        size = min(min(repeat.position.size for repeat in repeats), round(last[kind] / tick) + 1)
+        off = np.any([repeat.off[:size] for repeat in repeats], axis=0)
+        no_force, kept = _interior(off), ~_interior(_interior(off))
         time = np.arange(size)[kept] * tick
-        for number, one in enumerate(repeats, 1):
-            force = np.where(silent, 0.0, one.force[:size])
-            columns = {"time_s": time, "position_mm": one.position[:size][kept], "force_N": force[kept]}
+        for number, repeat in enumerate(repeats, 1):
+            force = np.where(no_force, 0.0, repeat.force[:size])
+            columns = {"time_s": time, "position_mm": repeat.position[:size][kept], "force_N": force[kept]}
             parts.append(pd.DataFrame({"test": kind, "repeat": number} | columns))
     return pd.concat(parts, ignore_index=True)
 
 
-def _within(off: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """All samples of each stay but its first and its last."""
+def _interior(off: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Mask without the first and last sample of each run."""
     inner = off.copy()
     inner[1:] &= off[:-1]
     inner[:-1] &= off[1:]
