@@ -1,14 +1,14 @@
-"""The bridge to a rendering device: a parameter set in, force and position out.
+"""Interface to a rendering device: send parameter sets, start and stop it, and read force and position.
 
     with Renderer.open("sim") as device:                       # or a port, or "socket://host:port"
         device.send(K0=-3.18, K1=5.58, B1=7.88, alpha=0.176)   # staged, committed, read back
         device.start()
         table = device.telemetry(2.0)
 
-The device decides last: it checks every set again, with its own damping, and refuses by name. It renders only while
-this process sends heartbeats, and is stopped when the block ends, however it ends. What is in force is read back and
-compared bit for bit. A device that restarts is never started again by itself. No JAX here; firmware/PROTOCOL.md is the
-wire.
+The firmware has the final say: it checks every set again, with its own damping, and rejects it with a reason. It
+renders only while this process sends heartbeats, and is stopped at the end of the block in every case. The set in force
+is read back and compared bit for bit. A device that restarts is never started again automatically. No JAX here;
+firmware/PROTOCOL.md specifies the wire protocol.
 
 Units: K N/mm, B1 N·s^α/mm, T s, mm, N, damping N·s/m.
 """
@@ -40,23 +40,23 @@ def __dir__() -> list[str]:
     return __all__
 
 
-_ANSWER = 0.1  # s
-_SIMULATED = 1.0  # s for an answer; the simulator shares this computer's processors
+_ANSWER = 0.1  # s for an answer
+_SIMULATED = 1.0  # s for an answer; the simulator shares this computer's CPU
 _LOCKSTEP = 30.0  # s, where no time passes meanwhile
 _POLL = 0.1  # s
-_NEAR = 0.01  # s between two looks at a handle that is to leave
-_SINKS = 1.0  # s for a force to sink to zero, of which the protocol allows 0.1
+_NEAR = 0.01  # s between two checks for contact
+_SINKS = 1.0  # s, timeout for the force to decay to zero; the protocol allows 0.1
 _STALLED = 20  # polls without telemetry
 _SHAPES = {"hold": 0, "triangle": 1, "step": 2, "nudge": 3}
 
 
 class Renderer:
-    """A connected device; `device` is what it said of itself (`HelloReply`), `notes` what a person should know.
+    """Connected device; `device` is its description (`HelloReply`), `notes` are messages for the user.
 
-    `simulator` is the `Simulator` behind a simulated one, else None.
+    `simulator` is the `Simulator` behind a simulated device, else None.
 
-    Make one with `open`. Every method raises `RefusalError` (an `InputError`) for numbers the device refuses, and
-    `DeviceError` when device or line fail; both say in one sentence what to do.
+    Construct with `open`. Every method raises `RefusalError` (an `InputError`) for numbers the device refuses, and
+    `DeviceError` when device or line fail, each with one sentence on what to do.
     """
 
     def __init__(
@@ -86,11 +86,11 @@ class Renderer:
     ) -> "Renderer":
         """Connect to "sim", a serial port, or "socket://host:port".
 
-        `damping` (N·s/m) and `delay` (s) are what a study counts on: a device with less damping, or one that checks its
-        sets for a longer delay of the force, is refused. `patience` (s) is for one answer,
-        0.1 on a line. `capture` gets every byte that arrives. `options` are those of the simulated device
-        (`simulator.Simulator`). Raises `InputError` for a line that cannot be opened, and `DeviceError` for one on
-        which no device of this protocol answers.
+        `damping` (N·s/m) and `delay` (s) are the values that a study assumes: a device with less damping, or one that
+        checks its sets for a longer delay of the force, is refused. `patience` (s) is the timeout of one answer,
+        default 0.1 on a line. `capture` receives all bytes that arrive. `options` are those of the simulated device
+        (`simulator.Simulator`). Raises `InputError` for a line that cannot be opened, and `DeviceError` if no device
+        with this protocol answers.
         """
         if where == "sim":
             from hilbo.device.local.simulator import Simulator
@@ -120,7 +120,7 @@ class Renderer:
                 raise
 
     def close(self) -> None:
-        """Stop the device and let go of the line. Raises `DeviceError` if it could not be told to stop."""
+        """Stop the device and close the line. Raises `DeviceError` if the stop could not be sent."""
         try:
             if self._link.lost is None:
                 self._link.request(protocol.Stop())
@@ -138,16 +138,16 @@ class Renderer:
 
     @property
     def can(self) -> Capability:
-        """What the device can do."""
+        """Capabilities of the device."""
         return Capability(self.device.capabilities)
 
     @property
     def link(self) -> Link:
-        """The conversation, with its counters."""
+        """Connection to the device, with its counters."""
         return self._link
 
     def _begin(self) -> None:
-        """A new conversation: who is there, at rest, heartbeats, telemetry."""
+        """Open a connection: handshake, stop of a moving device, heartbeats, telemetry."""
         self._link = self._connect()
         try:
             self.device = greet(self._link, self._damping, self._delay)
@@ -175,40 +175,41 @@ class Renderer:
         force_limit: SupportsFloat | None = None,
         wait: SupportsFloat = 5.0,
     ) -> InForce:
-        """Put a set in force: staged, committed, read back and compared bit for bit.
+        """Put a parameter set in force: stage, commit, read back and compare bit for bit.
 
-        In contact the device first warms the set's own history; `wait` is how long (s) that may take. `force_limit`
-        (N) is the device's own if not given. A set that is in force already is not sent again.
-        K0, K1 in N/mm, B1 in N·s^α/mm, T in s. Raises `InputError` for numbers that do not fit and for a set
-        that the device refuses, `DeviceError` if the line fails.
+        In contact the device first fills the history of the new set; `wait` (s) is the timeout for that. `force_limit`
+        (N): the device's own by default. A set that is in force already is not sent again. K0, K1 in N/mm, B1 in
+        N·s^α/mm, T in s. Raises `InputError` for numbers that do not fit and for a set that the device refuses,
+        `DeviceError` if the line fails.
         """
         numbers = {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "N": N, "T": T, "memory": memory, "states": states}
         wanted = wanted_for(self.device, **numbers, force_limit=force_limit)
         return put_in_force(self._link, self.device, wanted, float(wait))
 
     def in_force(self) -> InForce | None:
-        """The set in force, or None."""
+        """Parameter set in force; None if there is none."""
         return in_force(self._link.request(protocol.GetSet(bank=0)))
 
     @property
     def delay(self) -> float:
-        """Longest time from the sample of a position until its force is out, s: sets are checked for it."""
+        """Longest time (s) from the sample of a position to its force, for which the device checks its sets."""
         return self._link.request(protocol.GetLimits()).delay_us * 1e-6
 
     def home(self, position: SupportsFloat = 0.0) -> None:
-        """Tell a device without an absolute encoder that its handle stands at `position` (mm) now.
+        """Set the current position (mm) of the handle of a device without an absolute encoder.
+
         Raises `DeviceError` while it moves, `RefusalError` for a position outside of its stroke.
         """
         place = {"stop": self._link.stops, "position_mm": float(position)}
         self._link.request(protocol.Home(boot_id=self.device.boot_id, **place))
 
     def start(self, *, stop: int | None = None, wait: SupportsFloat = 5.0) -> None:
-        """Render the set that is in force. Telemetry from before is dropped.
+        """Start rendering the set in force. Earlier telemetry is dropped.
 
-        `stop` is the device's count of stops that the order follows (`link.stops`), by default what is known at the
-        call: after a later stop the device refuses it. `wait` is how long (s) the handle may stay in the material,
-        where nothing is started. Raises `DeviceError` if no set is in force, if the handle has not left by then, and
-        where the device refuses for another reason.
+        `stop`: the device's count of stops that the caller has seen (`link.stops`), by default the latest one known:
+        after a later stop the device refuses to start. `wait` (s): timeout for the handle to leave the material, since
+        nothing is started in contact. Raises `DeviceError` if no set is in force, if the handle stays in contact, and
+        for other refusals.
         """
         stop = self._link.stops if stop is None else stop
         current = self.in_force()
@@ -228,47 +229,47 @@ class Renderer:
             self._link.pause(_NEAR)
 
     def stop(self) -> None:
-        """Force to zero, smoothly."""
+        """Ramp the force to zero."""
         self._link.request(protocol.Stop())
 
     def estop(self) -> None:
-        """Force to zero at once, latched until `clear`."""
+        """Emergency stop: force to zero at once, latched until `clear`."""
         self._link.request(protocol.Estop())
 
     def clear(self, *, stop: int | None = None) -> None:
-        """Leave HOLD or ESTOP, once the reason is understood; the device first lets its force sink to zero.
+        """Leave HOLD or ESTOP, once the reason is understood; waits for the force to decay to zero.
 
-        `stop` is the stop that it ends (`link.stops`), by default the last one known at the call. A later stop stays,
-        and raises `DeviceError`.
+        `stop`: count of the stop that is cleared (`link.stops`), by default the last one known. A later stop stays in
+        effect and raises `DeviceError`.
         """
         clear = protocol.Clear(boot_id=self.device.boot_id, stop=self._link.stops if stop is None else stop)
         retry_while_busy(self._link, self.device, clear, self._link.now() + _SINKS)
 
     def status(self) -> Status:
-        """State and counters."""
+        """State and counters of the device."""
         return self._link.request(protocol.GetStatus())
 
     def state(self) -> State:
-        """The state alone."""
+        """State of the device."""
         return State(self.status().state)
 
     def condition(self) -> Condition:
-        """Homed or not, hardware stop, delay, and what the motor bears."""
+        """Homing, hardware stop, delay, and continuous force of the motor."""
         return condition_of(self.status(), self._link.request(protocol.GetLimits()))
 
     def limits(self) -> dict[str, tuple[float, float]]:
-        """What the device takes: lowest and highest K0, K1 (N/mm), B1 (N·s^α/mm) and alpha."""
+        """Ranges that the device accepts: lowest and highest K0, K1 (N/mm), B1 (N·s^α/mm) and alpha."""
         limits = self._link.request(protocol.GetLimits())
         return {n: (getattr(limits, f"{n}_low"), getattr(limits, f"{n}_high")) for n in ("K0", "K1", "B1", "alpha")}
 
     def echo(self, data: bytes) -> bytes:
-        """The same bytes back, from the device."""
+        """Send bytes to the device and return its echo."""
         return self._link.request(protocol.Echo(data=data)).data
 
     def stream(self, divisor: int = 1, *, sensed: bool | None = None) -> int:
-        """Telemetry of every `divisor`-th tick, or of as many as the line carries; 0 switches it off.
+        """Switch on telemetry of every `divisor`-th tick, or fewer if the line is too slow; 0 switches it off.
 
-        `sensed`: with the force sensor, by default where there is one. Returns the divisor in force.
+        `sensed`: include the force sensor, by default if there is one. Returns the divisor in force.
         """
         fields = int(bool(self.can & Capability.FORCE_SENSOR) if sensed is None else sensed)
         try:
@@ -292,10 +293,12 @@ class Renderer:
         duration: SupportsFloat,
         stop: int | None = None,
     ) -> None:
-        """The device moves by itself for `duration` s: see DRIVE in PROTOCOL.md. Force in N, position in mm, s.
+        """Let the device move by itself for `duration` s: see DRIVE in PROTOCOL.md.
 
-        `stop`: as for `start`.
-        Raises `InputError` for another mode or shape, `DeviceError` for a device that cannot move by itself.
+        Force in N, position in mm, times in s.
+
+        `stop`: as for `start`. Raises `InputError` for another mode or shape, `DeviceError` for a device that cannot
+        move by itself.
         """
         if not self.can & Capability.DRIVE:
             raise DeviceError(
@@ -312,14 +315,14 @@ class Renderer:
         )
 
     def _ticks(self, what: str, seconds: SupportsFloat) -> int:
-        """A time of a drive in ticks; whether the device takes so many is its own to say."""
+        """Convert a time (s) to ticks. Raises `InputError` for one that does not fit the message; `what` names it."""
         ticks = float(seconds) / self.tick_s
         if not 0 <= ticks < 2**32 - 1:  # NaN too
             raise InputError(f"The drive's {what} is {seconds} s; give a number from 0 to {2**32 * self.tick_s:.0f}.")
         return round(ticks)
 
     def telemetry(self, seconds: SupportsFloat = 1.0) -> Any:
-        """A pandas table of everything since `start` or the last call, after `seconds` more of the device's time.
+        """Pandas table of the telemetry since `start` or the last call, after `seconds` more of the device's time.
 
         Columns: tick, time_s, position_mm, force_N (commanded), sensed_N (NaN without sensor), flags (`SampleFlag`).
         Raises `DeviceError` if the line is lost or no telemetry comes.
@@ -327,9 +330,9 @@ class Renderer:
         return self.samples(seconds).table(self.tick_s)
 
     def samples(self, seconds: SupportsFloat = 1.0) -> Samples:
-        """The same over `seconds` of device time, as columns of numbers, without pandas.
+        """Telemetry as in `telemetry`, as arrays (n,) instead of a pandas table.
 
-        Arrays (n,), in the units of `telemetry`. Raises `DeviceError` if the line is lost or no telemetry comes.
+        Raises `DeviceError` if the line is lost or no telemetry comes.
         """
         if not math.isfinite(float(seconds)):
             raise InputError(f"The time is {seconds} s; give a number.")
@@ -342,12 +345,12 @@ class Renderer:
             elif self._link.lost:
                 raise DeviceError(self._link.lost)
             elif self._link.restarted or (quiet := quiet + 1) > _STALLED:
-                self.limits()  # says it better if device or line have a problem
+                self.limits()  # raises a more specific error if device or line have failed
                 raise DeviceError(f"{self._link.name}: no telemetry comes; switch it on with stream().")
         return joined([*pieces, buffer.take()])
 
     def _more(self) -> bool:
-        """Whether telemetry comes soon."""
+        """Wait for telemetry for up to `_POLL` s; return whether any came."""
         seen = self._buffer.counts()
         if self._link.ours:
             self._link.pause(_POLL / 2)
@@ -356,15 +359,15 @@ class Renderer:
         return self._buffer.counts() != seen
 
     def newest(self) -> Any:
-        """The newest telemetry message, or None; for displays."""
+        """Newest telemetry message, for displays; None before the first."""
         return self._buffer.newest
 
     def counts(self) -> Counts:
-        """Samples received, dropped by the device, and missing."""
+        """Counts of samples received, dropped by the device, and missing."""
         return self._buffer.counts()
 
     def events(self) -> list[str]:
-        """What the device has told unasked since the last call, in words."""
+        """Notices of the device since the last call, in words."""
         sentences = []
         with contextlib.suppress(IndexError):
             while True:
@@ -373,9 +376,9 @@ class Renderer:
         return sentences
 
     def reconnect(self, timeout: SupportsFloat = 5.0) -> bool:
-        """Connect again after the line or the device was away; True if the device has not restarted meanwhile.
+        """Connect again after the line or the device was away; return True if the device has not restarted meanwhile.
 
-        It is left stopped, and a restarted one without a set: send it again, and start it when somebody is ready.
+        The device is left stopped, and after a restart without a set: send the set again and start it when ready.
         `timeout` in s. Raises `DeviceError` if a simulated device has ended.
         """
         before, give_up = self.device.boot_id, time.monotonic() + float(timeout)
@@ -393,6 +396,7 @@ class Renderer:
 
 
 def _connected(port, baud, patience, capture, simulator) -> Link:
+    """Open the port and connect; the timeout of an answer defaults to that of the kind of device."""
     ticks = simulator.ticks if simulator is not None and simulator.lockstep else None
     if patience is None:
         patience = _LOCKSTEP if ticks else _SIMULATED if simulator else _ANSWER

@@ -1,17 +1,17 @@
-"""The fractional-order standard linear solid (FO-SLS): everything by one name, and its closed forms.
+"""Fractional-order standard linear solid (FO-SLS): public names of the model, and its closed forms over arrays.
 
 Continuous model H(s) = K0 + K1·B1·s^α / (K1 + B1·s^α), 0 < α <= 1. Sampled every T seconds with N past samples
-(Grünwald-Letnikov, short memory), or with a positive sum of exponentials in their place (full memory; see `memory`):
+(Grünwald-Letnikov, short memory), or with a positive sum of exponentials instead (full memory; see `memory`):
 
     c_0 = 1, c_i = c_{i-1}·(i-1-α)/i (negative for i >= 1),  C(z) = Σ_{i=0..N} c_i z^{-i},  β = B1·T^{-α}
     H(z) = K0 + K1·β·C(z) / (K1 + β·C(z))
 
-The record `FOSLS` is in `fosls`, the exact continuous functions in `continuous`, presets, special cases and loads in
-`materials`, the change of sets in contact in `switching`; all of them are names of this module too. Here the closed
-forms, which need S_N = C(1), M1 = -Σ i·c_i and C(-1) alone, are taken over arrays of parameters.
+The record `FOSLS` is defined in `fosls`, the exact continuous functions in `continuous`, presets, special cases and
+loads in `materials`, the change of sets in contact in `switching`; all are re-exported here. The closed forms in this
+module need only S_N = C(1), M1 = -Σ i·c_i and C(-1).
 
-Units: stiffness N/mm, B1 N·s^α/mm, T s, damping N·s/m. N and T belong to a parameter set: α means another material
-under another N. Reference: Podlubny (1999), Fractional Differential Equations, section 7.3 (short memory).
+Units: stiffness N/mm, B1 N·s^α/mm, T s, damping N·s/m. N and T belong to a parameter set: the same α with another N is
+another material. Reference: Podlubny (1999), Fractional Differential Equations, section 7.3 (short memory).
 """
 
 from collections.abc import Callable
@@ -83,10 +83,10 @@ def gl_alternating_sum(alpha: Reals, N: int) -> Float[Array, "..."]:
 def K0_from_effective_stiffness(
     K1: Reals, B1: Reals, alpha: Reals, K_eff: Reals = 0.44, N: int = 101, T: Reals = 1e-3, *, memory: Memory = "short"
 ) -> Float[Array, "..."]:
-    """K0 (N/mm) with which the rendering has the static stiffness H(1) = `K_eff` (N/mm); elementwise.
+    """K0 (N/mm) for which the rendering has the static stiffness H(1) = `K_eff` (N/mm); elementwise.
 
-    K1 and `K_eff` in N/mm, B1 in N·s^α/mm, T in s; arrays that broadcast. Raises `InputError` for values that no
-    model has, here and below; where they are traced the result is NaN.
+    K1 and `K_eff` in N/mm, B1 in N·s^α/mm, T in s; arrays that broadcast. Raises `InputError` for values out of range,
+    here and below; where these are traced the result is NaN.
     """
     return elementwise(_K0, span(memory, N), K1, B1, alpha, K_eff, T)
 
@@ -101,15 +101,15 @@ def dc_gain(
 def effective_damping(
     K1: Reals, B1: Reals, alpha: Reals, N: int = 101, T: Reals = 1e-3, *, memory: Memory = "short", states: int = 10
 ) -> Float[Array, "..."]:
-    """dH/ds at s = 0 (N·s/m): the damping felt in slow motion, T·K1²·β·M1/(K1 + β·S_N)²; elementwise."""
+    """Damping dH/ds at s = 0 (N·s/m), that of slow motion, T·K1²·β·M1/(K1 + β·S_N)²; elementwise."""
     return elementwise(_effective_damping, span(memory, N, states), K1, B1, alpha, T)
 
 
 def elementwise(function: Callable, span: Span, *args: Reals, batch: int | None = None) -> Float[Array, "..."]:
-    """Apply `function(span, *scalars)` over broadcast arguments in their common floating dtype, compiled once; `batch`
-    elements at a time where one takes much memory.
+    """Apply `function(span, *scalars)` over broadcast arguments in their common floating dtype, compiled once.
 
-    By the names of its parameters: raises `InputError` for what no model has; where that is traced, the result is NaN.
+    `batch`: elements computed at a time, if one takes much memory. Arguments named in `RANGES` are checked: raises
+    `InputError` for values out of range; where these are traced, the result is NaN.
     """
     names = _ranged(function)
     check_ranges(**{name: args[i] for i, name in names})
@@ -119,7 +119,7 @@ def elementwise(function: Callable, span: Span, *args: Reals, batch: int | None 
 
 @cache
 def _ranged(function: Callable) -> tuple[tuple[int, str], ...]:
-    """The scalars that have a range: their places after `span`, and their names. K0 may be any number here."""
+    """Positions (after `span`) and names of the parameters that have a range; K0 may be any number here."""
     names = [*signature(function).parameters][1:]
     return tuple((i, name) for i, name in enumerate(names) if name in RANGES and name != "K0")
 
@@ -128,6 +128,8 @@ def _ranged(function: Callable) -> tuple[tuple[int, str], ...]:
 def _compiled(
     function: Callable, span: Span, *args: Float[Array, "..."], batch: int | None = None
 ) -> Float[Array, "..."]:
+    """Compiled part of `elementwise`."""
+
     def one(*scalars):
         allowed = possible(**{name: scalars[i] for i, name in _ranged(function)})
         return jnp.where(allowed, function(span, *scalars), jnp.nan)
@@ -142,20 +144,25 @@ def _compiled(
 
 
 def _gl_sum(span: Span, alpha: Scalar) -> Scalar:
+    """S_N for one α."""
     return sums(alpha, span).at_dc
 
 
 def _gl_alternating_sum(span: Span, alpha: Scalar) -> Scalar:
+    """C(-1) for one α."""
     return sums(alpha, span).at_nyquist
 
 
 def _K0(span: Span, K1: Scalar, B1: Scalar, alpha: Scalar, K_eff: Scalar, T: Scalar) -> Scalar:
+    """K0 (N/mm) for one parameter set."""
     return K_eff - slow_stiffness(K1, pot_stiffness(B1, alpha, T), sums(alpha, span))
 
 
 def _dc_gain(span: Span, K0: Scalar, K1: Scalar, B1: Scalar, alpha: Scalar, T: Scalar) -> Scalar:
+    """H(1) (N/mm) of one parameter set."""
     return K0 + slow_stiffness(K1, pot_stiffness(B1, alpha, T), sums(alpha, span))
 
 
 def _effective_damping(span: Span, K1: Scalar, B1: Scalar, alpha: Scalar, T: Scalar) -> Scalar:
+    """dH/ds at s = 0 (N·s/m) of one parameter set."""
     return slow_damping(K1, pot_stiffness(B1, alpha, T), sums(alpha, span), T)

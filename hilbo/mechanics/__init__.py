@@ -1,5 +1,4 @@
-"""The fractional-order standard linear solid: memory, recursion, exact responses, materials, switching, and the
-certificate of passivity.
+"""Fractional-order standard linear solid (FO-SLS): memory, recursion, responses, special cases, switching, passivity.
 
-Imports `numerics`; `hilbo.viscoelastic` and `hilbo.passivity` are its public face.
+Imports `numerics`; `hilbo.viscoelastic` and `hilbo.passivity` are its public interface.
 """

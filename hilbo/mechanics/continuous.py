@@ -25,20 +25,21 @@ __all__ = ["creep_compliance", "relaxation_modulus"]
 
 
 def relaxation_modulus(t: Reals, K0: Reals, K1: Reals, B1: Reals, alpha: Reals) -> Float[Array, "..."]:
-    """G(t) in N/mm for t >= 0; elementwise, differentiable in every parameter, with derivative 0 of the t^α at t = 0.
+    """Relaxation modulus G(t) (N/mm) for t >= 0; elementwise.
 
-    K1 = inf, a spring-pot beside K0, gives K0 + B1·t^{-α}/Γ(1 - α), which is infinite at t = 0. Raises `InputError` for
-    values that no model has; where they are traced, and where B1 is 0, the result is NaN.
+    Differentiable in every parameter; the derivative of t^α at t = 0 is taken as 0. K1 = inf, a spring-pot parallel to
+    K0, gives K0 + B1·t^{-α}/Γ(1 - α), which is infinite at t = 0. Raises `InputError` for values outside their ranges;
+    where these are traced, and where B1 is 0, the result is NaN.
     """
     check_ranges(t=t, K1=K1, B1=B1, alpha=alpha)
     return _elementwise(_relaxation, t, K0, K1, B1, alpha)
 
 
 def creep_compliance(t: Reals, K0: Reals, K1: Reals, B1: Reals, alpha: Reals) -> Float[Array, "..."]:
-    """J(t) in mm/N for t >= 0 and K0 >= 0; elementwise and differentiable, K1 may be inf. Errors as those of
-    `relaxation_modulus`: under a load, a material of K0 < 0 creeps without end.
+    """Creep compliance J(t) (mm/N) for t >= 0 and K0 >= 0; elementwise and differentiable, K1 may be inf.
 
-    Creep with recovery by superposition: F1·J(t) + (F2 - F1)·J(t - t1) for t >= t1.
+    Errors as in `relaxation_modulus`; K0 < 0 is refused, since creep under a load would be unbounded. Creep with
+    recovery by superposition: F1·J(t) + (F2 - F1)·J(t - t1) for t >= t1.
     """
     check_ranges(t=t, K0=K0, K1=K1, B1=B1, alpha=alpha)
     return _elementwise(_creep, t, K0, K1, B1, alpha)
@@ -46,7 +47,7 @@ def creep_compliance(t: Reals, K0: Reals, K1: Reals, B1: Reals, alpha: Reals) ->
 
 @partial(jax.jit, static_argnums=0)
 def _elementwise(function: Callable, *args: Reals) -> Float[Array, "..."]:
-    """`function` of scalars over broadcast arguments, in their common floating dtype."""
+    """Apply a function of scalars over broadcast arguments, in their common floating dtype."""
     dtype = jnp.result_type(1.0, *args)
     return jnp.vectorize(function)(*(jnp.asarray(arg, dtype) for arg in args))
 
@@ -57,7 +58,7 @@ def _power(t: Scalar, alpha: Scalar) -> Scalar:
 
 
 def _relaxation(t: Scalar, K0: Scalar, K1: Scalar, B1: Scalar, alpha: Scalar) -> Scalar:
-    """G(t), and the spring-pot's where K1 is infinite."""
+    """G(t) of one parameter set, also for infinite K1; NaN for values outside their ranges."""
     power = _power(t, alpha)
     rigid = jnp.isinf(K1)
     spring = jnp.where(rigid, 1, K1)
@@ -70,7 +71,7 @@ def _relaxation(t: Scalar, K0: Scalar, K1: Scalar, B1: Scalar, alpha: Scalar) ->
 
 
 def _creep(t: Scalar, K0: Scalar, K1: Scalar, B1: Scalar, alpha: Scalar) -> Scalar:
-    """J(t) in the second form of this module's head."""
+    """J(t) of one parameter set, by the second form of the module docstring; NaN for values outside their ranges."""
     power = _power(t, alpha)
     ratio = share(K1, K0)  # K1/(K0 + K1)
     later = ratio**2 / B1 * power * mittag_leffler_increment(alpha, K0 * ratio / B1 * power)

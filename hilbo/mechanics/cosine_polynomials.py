@@ -1,8 +1,8 @@
-"""Cosine polynomials p(θ) = Σ p_j cos jθ: values and Taylor terms at many angles, and how low one can be near them.
+"""Cosine polynomials p(θ) = Σ p_j cos jθ: values, Taylor terms at many angles, and rigorous lower bounds.
 
 Around each angle Taylor's formula, with a remainder from the size of the coefficients, bounds p'' from below on a cell,
-and so p by a parabola. Towards the place where p is least the cells shrink in proportion to their distance from it, so
-that the bound is sharp to rounding. NumPy's numbers are computed by NumPy.
+and so p by a parabola. Near the minimum of p the cells shrink in proportion to their distance from it, so that the
+bound is sharp to rounding. NumPy inputs are computed by NumPy.
 """
 
 import math
@@ -25,35 +25,40 @@ _ROUNDING = 16  # units in the last place of Σ |p_j|
 
 
 def cells_for(degree: int) -> int:
-    """How many cells from 0 to π a polynomial of this degree is bounded on."""
+    """Number of cells from 0 to π on which a polynomial of this degree is bounded."""
     return 2 ** math.ceil(math.log2(_CELLS_PER_TAP * degree + _LEAST_CELLS))
 
 
 def rounding_unit(p: Coefficients) -> float:
-    """Rounding of a value, as a share of Σ |p_j|."""
+    """Rounding error of a value, relative to Σ |p_j|."""
     return _ROUNDING * namespace_of(p).finfo(p.dtype).eps
 
 
 def least(p: Coefficients, cells: int, best: Any, peak: Number) -> Number:
-    """A lower bound of p, before rounding; sharp where p is least near the angle `peak`, a cell at most from the node
-    of number `best`."""
+    """Lower bound of p before rounding errors; sharp if the minimum is near the angle `peak`.
+
+    `peak` is at most one cell away from grid node `best`.
+    """
     xp = namespace_of(p)
     width = math.pi / cells
     terms = rows(p, _ORDER + 1)
-    beside = xp.abs(xp.arange(cells + 1) - best) <= 1
+    is_adjacent = xp.abs(xp.arange(cells + 1) - best) <= 1
     cell = lowest(on_grid(terms, cells), xp.asarray(width / 2, p.dtype), terms)
-    ring = 2 * width * 0.5 ** xp.arange(_RINGS, dtype=p.dtype)
-    centre = xp.concatenate([0.75 * ring, -0.75 * ring, xp.zeros_like(ring[:1])])
-    radius = xp.concatenate([0.25 * ring, 0.25 * ring, 0.5 * ring[-1:]])
+    distance = 2 * width * 0.5 ** xp.arange(_RINGS, dtype=p.dtype)
+    centre = xp.concatenate([0.75 * distance, -0.75 * distance, xp.zeros_like(distance[:1])])
+    radius = xp.concatenate([0.25 * distance, 0.25 * distance, 0.5 * distance[-1:]])
     near = lowest(at_angles(terms, peak + centre), radius, terms)
-    return xp.minimum(xp.min(xp.where(beside, xp.inf, cell)), xp.min(near))
+    return xp.minimum(xp.min(xp.where(is_adjacent, xp.inf, cell)), xp.min(near))
 
 
 def climb(
     expand: Callable[[Number], tuple[Number, Number, Number]], degree: int, start: Number, width: float
 ) -> Number:
-    """The angle of the largest value within a cell's `width` of `start`: Newton, kept inside. `expand`: an angle -> its
-    value, and slope and bend per 1/degree of a polynomial that is least where the value is largest."""
+    """Angle of the maximum within `width` (one cell) of `start`, by Newton's method with steps kept in that interval.
+
+    `expand`: angle -> value, slope and second derivative, the latter two per 1/degree of a polynomial that is minimal
+    where the value is maximal. Returns `start` if no larger value is found.
+    """
     xp = namespace_of(start)
     low, high = xp.maximum(start - width, 0), xp.minimum(start + width, xp.pi)
 
@@ -67,7 +72,10 @@ def climb(
 
 
 def rows(p: Coefficients, count: int) -> Float[Any, "{count} n"]:
-    """p_j·(j/N)^m/m! for m < `count`: with cos, -sin, -cos, sin of jθ in turn, Taylor terms of p in units of 1/N."""
+    """Coefficients p_j·(j/N)^m/m! of the Taylor terms of order m < `count`, in units of 1/N.
+
+    With cos, -sin, -cos, sin of jθ in turn they are the Taylor terms of p. -> (count, n).
+    """
     xp = namespace_of(p)
     j = xp.arange(p.shape[0], dtype=p.dtype) / (p.shape[0] - 1)
     rows = [p]
@@ -77,7 +85,7 @@ def rows(p: Coefficients, count: int) -> Float[Any, "{count} n"]:
 
 
 def on_grid(rows: Float[Any, "m n"], cells: int) -> Float[Any, "m {cells+1}"]:
-    """Taylor terms at the angles πi/cells, i = 0 … cells, as (m, i)."""
+    """Taylor terms at the angles πi/cells, i = 0 … cells, as (m, i), by FFT."""
     xp = namespace_of(rows)
     turn = xp.asarray([1j**m for m in range(len(rows))], np.result_type(rows.dtype, np.complex64))
     half = xp.concatenate([2 * rows[:, :1], rows[:, 1:]], axis=1).astype(turn.dtype) * turn[:, None]
@@ -85,7 +93,7 @@ def on_grid(rows: Float[Any, "m n"], cells: int) -> Float[Any, "m {cells+1}"]:
 
 
 def at_angles(rows: Float[Any, "m n"], angles: Float[Any, " i"]) -> Float[Any, "m i"]:
-    """Taylor terms at any angles, as (m, i)."""
+    """Taylor terms at arbitrary angles, as (m, i)."""
     xp = namespace_of(rows, angles)
     turned = xp.arange(rows.shape[1], dtype=angles.dtype)[:, None] * angles[None, :]
     cos, sin = rows @ xp.cos(turned), rows @ xp.sin(turned)
@@ -93,12 +101,12 @@ def at_angles(rows: Float[Any, "m n"], angles: Float[Any, " i"]) -> Float[Any, "
 
 
 def lowest(taylor: Float[Any, "m i"], radius: Floats, rows: Float[Any, "m n"]) -> Float[Any, " i"]:
-    """Least value that p can take within `radius` of each angle; the last of the `rows` bounds the remainder."""
+    """Lower bound of p within `radius` of each angle; the last of the `rows` bounds the remainder."""
     xp = namespace_of(taylor, rows)
     order, scaled = len(rows) - 1, radius * (rows.shape[1] - 1)
     term = [taylor[m] * scaled**m for m in range(order)]
     remainder = xp.sum(xp.abs(rows[order])) * scaled**order
-    # Half the second derivative is never less than this, in units of the radius.
+    # Lower bound of half the second derivative, in units of the radius.
     bend = term[2] - sum(math.comb(m, 2) * xp.abs(term[m]) for m in range(3, order)) - math.comb(order, 2) * remainder
     slope = xp.abs(term[1])
     inside = 2 * bend > slope

@@ -1,12 +1,11 @@
-"""The damping that a late rendering needs, and the largest K1 of a device: the largest Y of `delay` over all
-frequencies, and the K1 at which it is that of the device.
+"""Damping needed by a delayed rendering, and the largest K1 of a device: maximum of Y (`delay`) over all frequencies.
 
-The largest Y lies at the Nyquist frequency for very short delays only, and no form of it is closed: it is sought on a
-grid of frequencies, and then between its nodes by a parabola. `certify` proves it for one set at a time, `ESTIMATED` is
-the difference.
+The maximum of Y lies at the Nyquist frequency for very short delays only and has no closed form: it is searched on a
+grid of frequencies, then refined by a parabola. `certify` proves it for one set at a time; `ESTIMATED` is the error of
+the search.
 
-The largest K1 is found by exchange, from above: the frequency that needs most, then the K1 with which it needs what the
-device has, and so on. A share `SAFE` of the damping is kept in reserve.
+The largest K1 is found by an exchange algorithm, from above: the frequency that needs most damping, then the K1 at
+which it needs the device's damping, and so on. A fraction `SAFE` of the damping is kept in reserve.
 
 Units: K N/mm, B1 N·s^α/mm, T and delay s, damping N·s/m.
 """
@@ -27,20 +26,20 @@ from hilbo.mechanics.span import Span
 __all__ = ["ESTIMATED", "SAFE", "delayed_damping", "delayed_largest_K1", "largest_need"]
 
 SAFE = 1e-5
-"""`delayed_largest_K1` keeps this share of b in reserve: more than the error of the largest Y between nodes."""
+"""Fraction of b that `delayed_largest_K1` keeps in reserve: more than the error of the maximum between nodes."""
 ESTIMATED = 1e-6
-"""Relative error of the largest Y that is found: 1e-9 with full memory, 1e-6 with short memory of 101 taps."""
+"""Relative error of the maximum of Y: 1e-9 with full memory, 1e-6 with short memory of 101 taps."""
 
 _NODES_PER_TAP = 4
 _LEAST_NODES = 256
 _NODES_OF_FULL_MEMORY = 512
-_FINER = 16  # of a node's distance, for the parabola at the peak
-_ROUNDS = 20  # of the exchange at most; 4 to 6 are enough
+_FINER = 16  # divisor of the node spacing for the parabola at the peak
+_ROUNDS = 20  # of the exchange at most; 4 to 6 are typical
 _HALVINGS = 40  # of the interval of K1/(K1 + β)
 
 
 class _Order(NamedTuple):
-    """An order α with its memory, and the sums of its coefficients."""
+    """Order α with its memory and the sums of its coefficients."""
 
     alpha: Scalar
     sums: GLSums
@@ -48,7 +47,10 @@ class _Order(NamedTuple):
 
 
 class _Nodes(NamedTuple):
-    """Frequencies, with what depends on α alone there. Real and imaginary parts apart: so they are vectorised."""
+    """Frequencies, with the quantities there that depend on α alone.
+
+    Real and imaginary parts separate for vectorisation.
+    """
 
     cos: Float[Array, " n"]
     sin: Float[Array, " n"]
@@ -58,7 +60,10 @@ class _Nodes(NamedTuple):
 
 
 class _Material(NamedTuple):
-    """A rendering but for C: K0 + series(K1, βC) = K_eff + β·slow·g·(C - S)/(g + h·C), g = K1/(K1 + β) = 1 - h."""
+    """Parameters of a rendering except C.
+
+    K0 + series(K1, βC) = K_eff + β·slow·g·(C - S)/(g + h·C), g = K1/(K1 + β) = 1 - h.
+    """
 
     K_eff: Scalar
     beta: Scalar
@@ -71,35 +76,41 @@ class _Material(NamedTuple):
 def delayed_damping(
     span: Span, K1: Scalar, B1: Scalar, alpha: Scalar, K_eff: Scalar, T: Scalar, delay: Scalar
 ) -> Scalar:
-    """b_min, N·s/m, to a relative `ESTIMATED`; inf where `K_eff` < 0, NaN for a `delay` above T."""
+    """Smallest passive damping b_min (N·s/m) with a delay (s), to a relative `ESTIMATED`.
+
+    inf where `K_eff` < 0, NaN for a `delay` above T.
+    """
     lag = _lag(delay, T)
     need, _ = largest_need(span, K1, pot_stiffness(B1, alpha, T), alpha, K_eff, lag)
     return jnp.where(K_eff < 0, jnp.inf, 500 * T * need)
 
 
 def _lag(delay: Scalar, T: Scalar) -> Scalar:
-    """σ, NaN for a delay above T."""
+    """σ = delay/T; NaN for a delay above T."""
     return jnp.where(delay <= T, delay / T, jnp.nan)
 
 
 def largest_need(
     span: Span, K1: Scalar, beta: Scalar, alpha: Scalar, K_eff: Scalar, lag: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """The largest Y (N/mm) of a set, and its angle; `lag` is σ."""
+    """Maximum of Y (N/mm) over all frequencies, and its angle; `lag` is σ."""
     order = _order(span, alpha)
     rendering = _material(K1, beta, order, K_eff)
-    fixed, still, (known, its_sums) = jax.lax.stop_gradient((rendering, lag, (alpha, order.sums)))
-    steady = _Order(known, its_sums, span)
-    angle = _peak(steady, _grid(steady), fixed, still)
-    # The angle is that of a maximum, so that first derivatives of Y need none of its own.
+    fixed, fixed_lag, (fixed_alpha, fixed_sums) = jax.lax.stop_gradient((rendering, lag, (alpha, order.sums)))
+    fixed_order = _Order(fixed_alpha, fixed_sums, span)
+    angle = _peak(fixed_order, _grid(fixed_order), fixed, fixed_lag)
+    # At the maximum, first derivatives of Y do not depend on the derivative of the angle.
     return _need(rendering, _at(order, angle[None]), lag)[0], angle
 
 
 def delayed_largest_K1(
     span: Span, B1: Scalar, alpha: Scalar, b: Scalar, K_eff: Scalar, T: Scalar, delay: Scalar
 ) -> Scalar:
-    """K1max, N/mm, which needs between b·(1 - 2·SAFE) and b; inf where every K1 is passive, 0 where b is below
-    `least_damping`. First derivatives are exact, second ones are those at the binding frequency."""
+    """Largest K1 (N/mm) that needs at most the damping b with a delay; it needs at least b·(1 - 2·SAFE).
+
+    inf where every K1 is passive, 0 where b is below `least_damping`. First derivatives are exact, second ones are
+    those at the binding frequency.
+    """
     lag = _lag(delay, T)
     Y, beta, order = b / (500 * T) * (1 - SAFE), pot_stiffness(B1, alpha, T), _order(span, alpha)
     impossible = (clear_of_spring(K_eff, lag) > Y) | (K_eff < 0)
@@ -113,12 +124,15 @@ def delayed_largest_K1(
     # A step of Newton's method from the solution has the solution's derivatives.
     value, slope = jax.jvp(need, (K1,), (jnp.ones_like(K1),))
     K1 = K1 - (value - Y) / jax.lax.stop_gradient(slope)
-    known = jnp.where(jnp.isnan(lag), jnp.nan, 0)
-    return known + jnp.where(impossible, 0, jnp.where(unlimited, jnp.inf, K1))
+    nan_or_0 = jnp.where(jnp.isnan(lag), jnp.nan, 0)
+    return nan_or_0 + jnp.where(impossible, 0, jnp.where(unlimited, jnp.inf, K1))
 
 
-def _solved(span, sought, beta, alpha, Y, K_eff, lag):
-    """K1max by exchange, the angle that binds, and whether every K1 is passive. NaN where the rounds do not end."""
+def _solved(span, active, beta, alpha, Y, K_eff, lag):
+    """Solve for the largest K1 by exchange: K1, the binding angle, and whether every K1 is passive.
+
+    NaN if the rounds are exhausted; `active` False skips the search.
+    """
     order = _order(span, alpha)
     grid, S = _grid(order), order.sums.at_dc
     tolerance = max(SAFE / 4, 32 * float(jnp.finfo(beta.dtype).eps))
@@ -127,7 +141,7 @@ def _solved(span, sought, beta, alpha, Y, K_eff, lag):
         return _Material(K_eff, beta, S, g, 1 - g, g / (g + (1 - g) * S))
 
     def reduced(g, node):
-        """The share up to `g` at which the need at a frequency rises through Y, to the precision of the halvings."""
+        """The g' <= g at which the need at a frequency reaches Y, by bisection."""
 
         def halve(_, ends):
             middle = (ends[0] + ends[1]) / 2
@@ -146,18 +160,20 @@ def _solved(span, sought, beta, alpha, Y, K_eff, lag):
     def unfinished(carry):
         return carry[3] & (carry[0] < _ROUNDS)
 
-    start = 0, jnp.ones_like(beta), jnp.ones_like(beta), sought
+    start = 0, jnp.ones_like(beta), jnp.ones_like(beta), active
     _, g, angle, more = jax.lax.while_loop(unfinished, exchange, start)
     return jnp.where(more, jnp.nan, beta * g / (1 - g)), angle, g == 1
 
 
 def _order(span: Span, alpha: Scalar) -> _Order:
+    """Order α with the sums of its coefficients."""
     return _Order(alpha, sums(alpha, span), span)
 
 
 def _material(K1, beta, order: _Order, K_eff) -> _Material:
+    """Parameters of a rendering; K1 = 0 or β = 0 is a spring alone."""
     S = order.sums.at_dc
-    # A spring alone is one with β = 0 beside any K1.
+    # A spring alone: β = 0, whatever K1 is.
     beta = jnp.where(K1 > 0, beta, 0)
     alone = beta == 0
     g, h = jnp.where(alone, 1, share(K1, beta)), jnp.where(alone, 0, share(beta, K1))
@@ -165,7 +181,7 @@ def _material(K1, beta, order: _Order, K_eff) -> _Material:
 
 
 def _need(m: _Material, nodes: _Nodes, lag: Scalar) -> Float[Array, " n"]:
-    """Y (N/mm) at each frequency."""
+    """Y (N/mm) at each frequency; `lag` is σ."""
     square = (m.g + m.h * nodes.real) ** 2 + (m.h * nodes.imag) ** 2
     size = m.beta * m.g / square
     # (C - S)·conj(g + h·C); the imaginary part is (g + h·S)·Im C, and g/slow = g + h·S.
@@ -175,38 +191,41 @@ def _need(m: _Material, nodes: _Nodes, lag: Scalar) -> Float[Array, " n"]:
     return larger_root(psi, lag * (1 - lag) * (real**2 + imaginary**2))
 
 
-def _place(span: Span, t: Float[Array, "*a"]) -> Float[Array, "*a"]:
-    """Angles of t in [0, 1]: even for taps, whose C ripples evenly; crowded at 0 for exponentials."""
+def _angle_of(span: Span, t: Float[Array, "*a"]) -> Float[Array, "*a"]:
+    """Angle of the grid parameter t in [0, 1]: uniform for taps, denser near 0 for exponentials."""
     return math.pi * (t if span.memory == "short" else t**3)
 
 
 def _count(span: Span) -> int:
+    """Number of grid intervals."""
     if span.memory == "full":
         return _NODES_OF_FULL_MEMORY
     return max(_LEAST_NODES, 2 ** math.ceil(math.log2(_NODES_PER_TAP * (span.N + 1))))
 
 
 def _grid(order: _Order) -> _Nodes:
-    """Nodes from 0 to π, in even steps of t."""
+    """Nodes from 0 to π, uniform in the grid parameter."""
     span, count = order.span, _count(order.span)
-    angle = _place(span, jnp.arange(count + 1, dtype=order.alpha.dtype) / count)
+    angle = _angle_of(span, jnp.arange(count + 1, dtype=order.alpha.dtype) / count)
     if span.memory == "full":
         return _at(order, angle)
     return _nodes(order, angle, jnp.fft.rfft(gl_coefficients(order.alpha, span.N), 2 * count))
 
 
 def _at(order: _Order, angle: Float[Array, " n"]) -> _Nodes:
+    """Nodes at arbitrary angles."""
     return _nodes(order, angle, response(order.alpha, angle, order.span))
 
 
 def _nodes(order: _Order, angle: Float[Array, " n"], C: Complex[Array, " n"]) -> _Nodes:
+    """Nodes from angles and the values of C there."""
     moving = angle > 0
     lead = jnp.where(moving, C.imag / jnp.tan(jnp.where(moving, angle, 1) / 2), 2 * order.sums.moment)
     return _Nodes(jnp.cos(angle), jnp.sin(angle), C.real, C.imag, lead)
 
 
 def _peak(order: _Order, grid: _Nodes, m: _Material, lag: Scalar) -> Scalar:
-    """The angle of the largest Y: by the parabolas through neighbouring nodes, and one through closer ones."""
+    """Angle of the maximum of Y: parabolas through neighbouring grid nodes, refined by one through closer points."""
     Y, count = _need(m, grid, lag), grid.real.shape[0] - 1
     # Y is even about both ends.
     below, above = jnp.concatenate([Y[1:2], Y[:-1]]), jnp.concatenate([Y[1:], Y[-2:-1]])
@@ -214,15 +233,17 @@ def _peak(order: _Order, grid: _Nodes, m: _Material, lag: Scalar) -> Scalar:
     best = jnp.argmax(top)
     t, step = (best.astype(Y.dtype) + shift[best]) / count, 1 / (_FINER * count)
     near = jnp.abs(t + step * jnp.arange(-1.0, 2.0, dtype=t.dtype))
-    _, shift = _vertex(*_need(m, _at(order, _place(order.span, near)), lag))
-    return _place(order.span, jnp.clip(t + shift * step, 0, 1))
+    _, shift = _vertex(*_need(m, _at(order, _angle_of(order.span, near)), lag))
+    return _angle_of(order.span, jnp.clip(t + shift * step, 0, 1))
 
 
 def _vertex(
     below: Float[Array, "*a"], middle: Float[Array, "*a"], above: Float[Array, "*a"]
 ) -> tuple[Float[Array, "*a"], Float[Array, "*a"]]:
-    """Height of the parabola through three even values where it has a top beside the middle one, and its place in
-    steps; else the middle value."""
+    """Vertex of the parabola through three equidistant values: its height, and its offset from the middle in steps.
+
+    The middle value and 0 if the vertex is a minimum or more than half a step away.
+    """
     bend, slope = 2 * middle - below - above, (above - below) / 2
     inside = 2 * jnp.abs(slope) <= bend
     shift = jnp.where(inside, slope / jnp.where(inside & (bend > 0), bend, 1), 0)

@@ -1,11 +1,13 @@
-"""An enclosure of the damping that a late rendering needs at any frequency, for short memory; an estimate for full.
+"""Enclosure of the damping that a delayed rendering needs at any frequency.
 
-With Y of `delay` and A of `response_polynomials`, the damping (T/2)·Y* is enough at every frequency if
+Proved for short memory, estimated for full.
+
+With Y of `delay` and A of `response_polynomials`, the damping (T/2)·Y* is sufficient at every frequency if
 
     P = Y*²·A - Y*·ψA - σ(1 - σ)·|H|²A
 
-is never negative, a cosine polynomial of degree N + 1. With a lower bound -E < 0 of P a little more is enough: where
--E <= P < 0 the slope dP/dY = 2·Y*·A - ψA is Y*·A - E/Y* at least, and so Y* + E·Y*/(Y*²·min A - E) is enough.
+is never negative, a cosine polynomial of degree N + 1. With a lower bound -E < 0 of P slightly more is sufficient:
+where -E <= P < 0 the slope dP/dY = 2·Y*·A - ψA is Y*·A - E/Y* at least, and so Y* + E·Y*/(Y*²·min A - E) is sufficient.
 """
 
 import math
@@ -27,7 +29,7 @@ _Polynomials = tuple[Coefficients, Coefficients, Coefficients]
 
 
 def short_enclosure(model: FOSLS, lag: Number) -> tuple[Number, Number, Number]:
-    """Bounds of max Y (N/mm) over all angles, and the angle of the largest Y found; `lag` is σ."""
+    """Lower and upper bound of max Y (N/mm) over all angles, and the angle of the maximum found; `lag` is σ."""
     polynomials, least_A = _polynomials(model, lag)
     A, U, W = polynomials
     xp = namespace_of(A)
@@ -52,14 +54,14 @@ def short_enclosure(model: FOSLS, lag: Number) -> tuple[Number, Number, Number]:
 
 
 def full_estimate(model: FOSLS, lag: Number) -> tuple[Scalar, Scalar, Scalar]:
-    """As `short_enclosure`, for full memory: the largest Y found, with the error of such a search and no proof."""
+    """Counterpart of `short_enclosure` for full memory: maximum found -/+ the error of the search, not proved."""
     largest, angle = largest_need(model.span, model.K1, model.beta, model.alpha, model.dc_gain(), lag)
     error = ESTIMATED * jnp.abs(largest)
     return largest - error, largest + error, angle
 
 
 def _polynomials(model: FOSLS, lag: Number) -> tuple[_Polynomials, Number]:
-    """Cosine coefficients of A, ψA and σ(1 - σ)·|H|²A, all of degree N + 1, and the least value of A."""
+    """Cosine coefficients of A, ψA and σ(1 - σ)·|H|²A, all of degree N + 1, and the minimum of A."""
     parts = parts_of(model)
     xp = namespace_of(parts.A)
     zero = xp.zeros(1, parts.A.dtype)
@@ -72,7 +74,7 @@ def _polynomials(model: FOSLS, lag: Number) -> tuple[_Polynomials, Number]:
 
 
 def _expand(polynomials: _Polynomials, angle: Number) -> tuple[Number, Number, Number]:
-    """Y at an angle, with slope and bend of P for this number Y, per 1/(N + 1)."""
+    """Y at an angle, with slope and second derivative of P for this Y, per 1/(N + 1)."""
     a, u, w = (at_angles(rows(p, 3), angle[None])[:, 0] for p in polynomials)
     Y = larger_root(u[0] / a[0], w[0] / a[0])
     return Y, Y**2 * a[1] - Y * u[1] - w[1], 2 * (Y**2 * a[2] - Y * u[2] - w[2])

@@ -1,7 +1,7 @@
-"""A few exponentials for the whole memory of a fractional derivative: p_k(α) >= 0 and λ_k(α) in [0, 1).
+"""Sum of exponentials for the full memory of a fractional derivative: weights p_k(α) >= 0 and decays λ_k(α) in [0, 1).
 
 C(z) = (1 - z^{-1})^α is the mean of (1 - z^{-1})/(1 - λ z^{-1}) over λ ~ Beta(1 - α, α) (see `memory`). The quadrature
-here keeps three properties of the mean exactly, whatever the coefficients below:
+here keeps three properties of the mean exactly, for any coefficients below:
 
     Σ p_k = 1 (so C's first coefficient is 1),   C(1) = 0,   C(-1) = Σ p_k·2/(1 + λ_k) = 2^α,
 
@@ -26,7 +26,10 @@ __all__ = ["TABLE", "decode", "exponentials"]
 def exponentials(
     alpha: Float[Array, ""], states: int = 10
 ) -> tuple[Float[Array, " {states}"], Float[Array, " {states}"]]:
-    """p_k and 1 - λ_k of order α in [0, 1], fastest first, for one of the numbers of `span.STATES`; differentiable."""
+    """Weights p_k and losses 1 - λ_k of order α in [0, 1], fastest first; differentiable.
+
+    `states`: number of exponentials, one of `span.STATES`.
+    """
     table = jnp.asarray(TABLE[states], alpha.dtype)
     x = 2 * alpha - 1
     basis = [jnp.ones_like(x), x]
@@ -39,9 +42,12 @@ def exponentials(
 def decode(
     rates: Float[Array, " m"], logits: Float[Array, " m"], alpha: Float[Array, ""]
 ) -> tuple[Float[Array, " m+1"], Float[Array, " m+1"]]:
-    """p_k and 1 - λ_k, fastest first, from the values of the polynomials (`logits` of the second one on)."""
-    beside = 1 - alpha
-    ends = jnp.stack([alpha, *[alpha * beside] * (logits.shape[0] - 1), beside])
+    """Weights p_k and losses 1 - λ_k, fastest first, from the polynomials' values.
+
+    `rates`: log r_k of all exponentials but the first; `logits`: log weights of the same.
+    """
+    complement = 1 - alpha
+    ends = jnp.stack([alpha, *[alpha * complement] * (logits.shape[0] - 1), complement])
     weight = ends * jnp.exp(jnp.concatenate([jnp.zeros_like(logits[:1]), logits]))
     weight = weight / jnp.sum(weight)
     rate = jnp.exp(rates).at[-1].multiply(alpha)

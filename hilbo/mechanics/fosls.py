@@ -1,19 +1,19 @@
-"""The FO-SLS as a record: one parameter set, its responses, and its force or position in time.
+"""Record of one FO-SLS parameter set, with its frequency response and its force or position in time.
 
 Continuous model H(s) = K0 + K1·B1·s^α / (K1 + B1·s^α), 0 < α <= 1. Sampled every T seconds (see `memory` for C)
 
     β = B1·T^{-α},   H(z) = K0 + K1·β·C(z) / (K1 + β·C(z))
 
-One history, the elongation y of the spring-pot, gives force from position or position from force. With
-g = K1/(K1 + β), k = K1·β/(K1 + β) and s_n = Σ |c_i|·y_{n-i}
+One history, the elongation y of the spring-pot, gives force from position or position from force. With g = K1/(K1 + β),
+k = K1·β/(K1 + β) and s_n = Σ |c_i|·y_{n-i}
 
     F_n = K0·x_n + k·(x_n - s_n),   x_n = (F_n + k·s_n)/(K0 + k),   y_n = s_n + g·(x_n - s_n)
 
-g and k are written through β/K1 or K1/β, whichever is at most 1, so that a spring (K1 = 0), a spring-pot (K1 = inf) and
-what lies between are one code.
+g and k are computed from β/K1 or K1/β, whichever is at most 1, so that a spring (K1 = 0), a spring-pot (K1 = inf) and
+all cases between share one code.
 
-Units: stiffness N/mm, B1 N·s^α/mm, T s, x mm, F N, damping N·s/m. Memory, N and T belong to a parameter set: α means
-another material under another N. Reference: Podlubny (1999), Fractional Differential Equations, section 7.3.
+Units: stiffness N/mm, B1 N·s^α/mm, T s, x mm, F N, damping N·s/m. Memory, N and T belong to a parameter set: the same α
+with another N is another material. Reference: Podlubny (1999), Fractional Differential Equations, section 7.3.
 """
 
 import math
@@ -43,13 +43,15 @@ _LONGEST_RELAXATION = 1_000_000  # samples
 
 
 class FOSLS(eqx.Module):
-    """One parameter set of the FO-SLS, with the memory (short: `N` taps; full: `states` exponentials) and T it is for.
+    """One parameter set of the FO-SLS with its memory (short: `N` taps.
 
-    K0, K1 (N/mm), B1 (N·s^α/mm) and alpha are scalars of one floating dtype; `jax.vmap` over records or over
-    constructors for several. Of NumPy's numbers, `dc_gain`, `beta` and the passivity certificate of short memory are
-    computed by NumPy, at once. K1 may be `inf`: K0 beside a spring-pot. Raises InputError for K1 < 0, B1 < 0, α outside
-    (0, 1], numbers that are not finite, and for K0 < 0 with full memory. Inside `jit`, where values are unknown, alpha
-    is NaN for what no model has, and so is what follows from it.
+    Full: `states` exponentials) and sampling time T.
+
+    K0, K1 (N/mm), B1 (N·s^α/mm) and alpha are scalars of one floating dtype; use `jax.vmap` over records or over
+    constructors for several. For NumPy inputs, `dc_gain`, `beta` and the passivity certificate of short memory are
+    computed by NumPy, without compilation. K1 may be `inf`: K0 parallel to a spring-pot. Raises InputError for K1 < 0,
+    B1 < 0, α outside (0, 1], numbers that are not finite, and for K0 < 0 with full memory. Inside `jit`, where values
+    are unknown, invalid values set alpha to NaN, and so all results.
     """
 
     K0: Number
@@ -96,7 +98,7 @@ class FOSLS(eqx.Module):
 
     @property
     def span(self) -> Span:
-        """How far the model looks back."""
+        """Memory of the model."""
         return span(self.memory, self.N, self.states)
 
     @property
@@ -134,7 +136,7 @@ class FOSLS(eqx.Module):
         return self.K0 + series(self.K1, self.beta)
 
     def effective_damping(self) -> Number:
-        """dH/ds at s = 0, N·s/m: the damping felt in slow motion. B1 where K1 is infinite and α = 1. A scalar."""
+        """dH/ds at s = 0, N·s/m: the damping in slow motion. B1 where K1 is infinite and α = 1. A scalar."""
         return slow_damping(self.K1, self.beta, sums(self.alpha, self.span), self.T)
 
     def simulate(
@@ -167,11 +169,13 @@ class FOSLS(eqx.Module):
         return samples
 
     def settling_time(self, fraction: float) -> Scalar:
-        """Time (s) of the first sample at which this `fraction` of the relaxation after a step is over.
+        """Time (s) of the first sample at which this `fraction` of the relaxation after a step is complete.
 
-        0.9 for t90. With short memory counted sample by sample, `inf` beyond a million samples; with full memory the
-        time t at which E_α(-(K1/B1)·t^α) = 1 - fraction, which may be years.
-        A scalar. Raises `InputError` for a `fraction` that is not at least 0 and below 1.
+        0.9 for t90.
+
+        With short memory counted sample by sample, `inf` beyond a million samples; with full memory the time t at which
+        E_α(-(K1/B1)·t^α) = 1 - fraction, which may be years. A scalar. Raises `InputError` for a `fraction` that is not
+        at least 0 and below 1.
         """
         if not 0 <= fraction < 1:
             raise InputError(f"fraction is {fraction}; it must be at least 0 and below 1; write 0.9 for t90.")
@@ -180,30 +184,30 @@ class FOSLS(eqx.Module):
 
 
 def series(K1: Floats, pot: Inexact[Any, "..."]) -> Inexact[Any, "..."]:
-    """Stiffness of a spring and a pot in series, K1·pot/(K1 + pot), for every K1 from 0 to inf and complex `pot`.
+    """Stiffness of a spring and a spring-pot in series, K1·pot/(K1 + pot), for any K1 from 0 to inf and complex `pot`.
 
     N/mm; elementwise.
     """
     xp = namespace_of(K1, pot)
-    firm = (xp.abs(pot) <= K1) & (K1 > 0)
-    compliance = (1 / xp.where(firm, K1, 1)).astype(pot.dtype)
-    spring, pot_of_soft = xp.where(firm, 0, K1).astype(pot.dtype), xp.where(firm | (pot == 0), 1, pot)
-    return xp.where(firm, pot / (1 + compliance * pot), spring / (1 + spring / pot_of_soft))
+    stiff = (xp.abs(pot) <= K1) & (K1 > 0)
+    compliance = (1 / xp.where(stiff, K1, 1)).astype(pot.dtype)
+    spring, pot_of_soft = xp.where(stiff, 0, K1).astype(pot.dtype), xp.where(stiff | (pot == 0), 1, pot)
+    return xp.where(stiff, pot / (1 + compliance * pot), spring / (1 + spring / pot_of_soft))
 
 
 def share(K1: Floats, pot: Floats) -> Floats:
-    """Share of the pot in the elongation of spring and pot in series, K1/(K1 + pot), for every K1 from 0 to inf.
+    """Elongation of the spring-pot as a fraction of the total in series with K1, K1/(K1 + pot), for K1 from 0 to inf.
 
-    N/mm -> no unit; elementwise.
+    N/mm -> dimensionless; elementwise.
     """
     xp = namespace_of(K1, pot)
-    firm = (pot <= K1) & (K1 > 0)
-    ratio = xp.where(firm, 0, K1) / xp.where(firm | (pot == 0), 1, pot)
-    return xp.where(firm, 1 / (1 + pot / xp.where(firm, K1, 1)), ratio / (1 + ratio))
+    stiff = (pot <= K1) & (K1 > 0)
+    ratio = xp.where(stiff, 0, K1) / xp.where(stiff | (pot == 0), 1, pot)
+    return xp.where(stiff, 1 / (1 + pot / xp.where(stiff, K1, 1)), ratio / (1 + ratio))
 
 
 def pot_stiffness(B1: Floats, alpha: Floats, T: float | Floats) -> Floats:
-    """β = B1·T^{-α}, N/mm: the stiffness of the spring-pot in the sample of a step.
+    """Stiffness β = B1·T^{-α} (N/mm) of the spring-pot within the sample of a step.
 
     B1 in N·s^α/mm, T in s; elementwise.
     """
@@ -211,7 +215,7 @@ def pot_stiffness(B1: Floats, alpha: Floats, T: float | Floats) -> Floats:
 
 
 def slow_stiffness(K1: Number, beta: Number, gl: GLSums) -> Number:
-    """H(1) - K0, N/mm: what spring and spring-pot in series add to the static stiffness.
+    """H(1) - K0, N/mm: static stiffness of spring and spring-pot in series.
 
     K1 and `beta` are scalars, in N/mm.
     """
@@ -219,21 +223,23 @@ def slow_stiffness(K1: Number, beta: Number, gl: GLSums) -> Number:
 
 
 def slow_damping(K1: Number, beta: Number, gl: GLSums, T: float | Number) -> Number:
-    """dH/ds at s = 0, N·s/m: T·K1²·β·M1/(K1 + β·S_N)²; 1000·T is T for stiffness in N/mm.
+    """dH/ds at s = 0, N·s/m: T·K1²·β·M1/(K1 + β·S_N)².
 
-    K1 and `beta` are scalars, in N/mm, T in s.
+    K1 and `beta` are scalars, in N/mm, T in s; the factor 1000 converts N·s/mm to N·s/m.
     """
     return 1000 * T * beta * gl.moment * share(K1, beta * gl.at_dc) ** 2
 
 
 @program
 def _frequency_response(model: FOSLS, omega: Float[Array, "*w"]) -> Complex[Array, "*w"]:
+    """H (N/mm) at angular frequencies ω (rad/s)."""
     pot = response(model.alpha, omega * model.T, model.span)
     return model.K0.astype(pot.dtype) + series(model.K1, model.beta.astype(pot.dtype) * pot)
 
 
 @program
 def _force(model: FOSLS, x: Float[Array, " n"], start: Start, unilateral: bool, block: int) -> Float[Array, " n"]:
+    """Force (N) at each position of x (mm); arguments as in `FOSLS.simulate`."""
     beta = model.beta
     gain, stiffness = share(model.K1, beta), series(model.K1, beta)
     x = jnp.maximum(x, 0) if unilateral else x
@@ -247,6 +253,7 @@ def _force(model: FOSLS, x: Float[Array, " n"], start: Start, unilateral: bool, 
 
 @program
 def _position(model: FOSLS, F: Float[Array, " n"], start: Start, block: int) -> Float[Array, " n"]:
+    """Position (mm) at each force of F (N)."""
     beta = model.beta
     gain, stiffness = share(model.K1, beta), series(model.K1, beta)
     total = model.K0 + stiffness
@@ -259,7 +266,10 @@ def _position(model: FOSLS, F: Float[Array, " n"], start: Start, block: int) -> 
 
 @program
 def _short_settling(model: FOSLS, fraction: Scalar) -> Scalar:
-    """First sample n with s_n >= fraction·s_inf after a unit step: the force relaxes as s grows, and s only grows."""
+    """Settling time with short memory: T times the first n with s_n >= fraction·s_inf after a unit step.
+
+    s only grows, and the force relaxes with it.
+    """
     beta, gl = model.beta, sums(model.alpha, model.span)
     gain, feedback = share(model.K1, beta), share(beta, model.K1)
     goal = fraction * (1 - gl.at_dc) * share(model.K1, beta * gl.at_dc)
@@ -280,13 +290,13 @@ def _short_settling(model: FOSLS, fraction: Scalar) -> Scalar:
 
 @program
 def _full_settling(model: FOSLS, fraction: Scalar) -> Scalar:
-    """z with E_α(-z) = 1 - fraction by bisection of log z, and the time it stands for."""
+    """Settling time with full memory: bisection of log z for E_α(-z) = 1 - fraction."""
 
     def halve(_, ends):
         low, high = ends
         middle = (low + high) / 2
-        late = mittag_leffler(model.alpha, jnp.exp(middle)) < 1 - fraction
-        return jnp.where(late, low, middle), jnp.where(late, middle, high)
+        settled = mittag_leffler(model.alpha, jnp.exp(middle)) < 1 - fraction
+        return jnp.where(settled, low, middle), jnp.where(settled, middle, high)
 
     widest = jnp.asarray(80, fraction.dtype)
     log_z, _ = jax.lax.fori_loop(0, 60, halve, (-widest, widest))
@@ -294,12 +304,14 @@ def _full_settling(model: FOSLS, fraction: Scalar) -> Scalar:
 
 
 def _checked_start(start: Start) -> Start:
+    """Return `start`. Raises `InputError` unless it is "rest" or "equilibrium"."""
     if start not in get_args(Start):
         raise InputError(f'start is "{start}"; it must be "rest" or "equilibrium".')
     return start
 
 
 def _check_values(K0: float, K1: float, B1: float, alpha: float, memory: Memory) -> None:
+    """Raise `InputError` for parameter values outside their ranges."""
     if not 0 < alpha <= 1:
         raise InputError(f"alpha is {alpha}; it must be above 0 and at most 1: the order of the fractional element.")
     for name, value, most in (("K1", K1, math.inf), ("B1", B1, math.nextafter(math.inf, 0))):

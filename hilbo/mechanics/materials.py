@@ -1,13 +1,13 @@
-"""Parameter sets of the paper, the classical models as special cases of the FO-SLS, and the loads of the tests.
+"""Parameter sets of the paper, classical models as special cases of the FO-SLS, and the load histories of the tests.
 
     spring          F = K·x                                  K0 = K, K1 = 0
     spring-pot      F = B·d^α x                              K0 = 0, K1 = inf
     Kelvin-Voigt    F = K·x + B·dx/dt                        K0 = K, K1 = inf, α = 1
     Maxwell         spring and dashpot in series             K0 = 0, α = 1
-    SLS             Maxwell beside a spring                  α = 1
+    SLS             Maxwell parallel to a spring             α = 1
 
-All of them run through the same code as the FO-SLS, so that models of growing complexity can be compared.
-Units: N/mm, N·s^α/mm, s, mm, N.
+All of them run through the same code as the FO-SLS, so that models of growing complexity can be compared. Units: N/mm,
+N·s^α/mm, s, mm, N.
 """
 
 from typing import NamedTuple
@@ -32,7 +32,7 @@ __all__ = [
 
 
 class Preset(NamedTuple):
-    """A published parameter set, with the N and T that it belongs to, and where it is published."""
+    """Published parameter set with its N, T and source."""
 
     K0: float
     K1: float
@@ -43,7 +43,7 @@ class Preset(NamedTuple):
     source: str
 
     def model(self) -> FOSLS:
-        """The record of this set."""
+        """The set as an `FOSLS`."""
         return FOSLS(*self[:4], N=self.N, T=self.T)
 
 
@@ -63,27 +63,27 @@ PRESETS = {
 
 
 def spring(K: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """F = K·x. `memory`: N, T, memory and states of the record, here and below. K in N/mm, a scalar."""
+    """Spring F = K·x. K in N/mm, a scalar; `memory`: N, T, memory and states of the `FOSLS`, here and below."""
     return FOSLS(K, 0.0, 0.0, 1.0, **memory)
 
 
 def springpot(B: Real[ArrayLike, ""], alpha: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """F = B·d^α x/dt^α. B in N·s^α/mm, a scalar, as is `alpha`."""
+    """Spring-pot F = B·d^α x/dt^α. B in N·s^α/mm, a scalar, as is `alpha`."""
     return FOSLS(0.0, np.inf, B, alpha, **memory)
 
 
 def kelvin_voigt(K: Real[ArrayLike, ""], B: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """Spring and dashpot side by side. K in N/mm, B in N·s/mm, scalars."""
+    """Kelvin-Voigt model: spring and dashpot in parallel. K in N/mm, B in N·s/mm, scalars."""
     return FOSLS(K, np.inf, B, 1.0, **memory)
 
 
 def maxwell(K: Real[ArrayLike, ""], B: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """Spring and dashpot in series. K in N/mm, B in N·s/mm, scalars."""
+    """Maxwell model: spring and dashpot in series. K in N/mm, B in N·s/mm, scalars."""
     return FOSLS(0.0, K, B, 1.0, **memory)
 
 
 def sls(K0: Real[ArrayLike, ""], K1: Real[ArrayLike, ""], B: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """Standard linear solid: Maxwell beside a spring K0. K0 and K1 in N/mm, B in N·s/mm, scalars."""
+    """Standard linear solid: Maxwell model parallel to a spring K0. K0 and K1 in N/mm, B in N·s/mm, scalars."""
     return FOSLS(K0, K1, B, 1.0, **memory)
 
 

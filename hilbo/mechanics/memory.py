@@ -1,4 +1,4 @@
-"""The memory of a fractional derivative: Grünwald-Letnikov taps, or a positive sum of exponentials.
+"""Memory of a fractional derivative: Grünwald-Letnikov coefficients, or a positive sum of exponentials.
 
 Sampled every T seconds, a derivative of order α is T^{-α}·C(z). With the partial sums S_i = Π_{j=1..i} (1 - α/j)
 
@@ -7,11 +7,11 @@ Sampled every T seconds, a derivative of order α is T^{-α}·C(z). With the par
 
 The S_i are the moments E[λ^i] of a beta distribution, λ ~ Beta(1 - α, α), so that full memory is a mixture of decays,
 C(z) = E[(1 - z^{-1})/(1 - λ z^{-1})], and a positive quadrature p_k, λ_k turns it into a few exponentials: see
-`exponentials`. There C(1) = 0, C(-1) = 2^α, and M1 = Σ p_k/(1 - λ_k) measures how far back the slowest one looks:
+`exponentials`. There C(1) = 0, C(-1) = 2^α, and M1 = Σ p_k/(1 - λ_k) is finite, determined by the slowest exponential;
 that of (1 - z^{-1})^α itself is infinite.
 
-|c_i| = (α/i)·S_{i-1} are products of positive numbers, in which no digit is lost at either end of α.
-Reference: Podlubny (1999), Fractional Differential Equations, section 7.3 (short memory).
+|c_i| = (α/i)·S_{i-1} are products of positive numbers, so there is no cancellation at either end of α. Reference:
+Podlubny (1999), Fractional Differential Equations, section 7.3 (short memory).
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ __all__ = ["GLSums", "gl_coefficients", "gl_sums", "response", "sums"]
 
 
 class GLSums(eqx.Module):
-    """The four sums of Grünwald-Letnikov coefficients that the closed forms need."""
+    """The sums of Grünwald-Letnikov coefficients used by the closed forms."""
 
     at_dc: Number  # S_N = C(1)
     at_nyquist: Number  # C(-1), close to 2^α
@@ -42,7 +42,7 @@ class GLSums(eqx.Module):
 
 
 def sums(alpha: Real[ArrayLike, ""], span: Span) -> GLSums:
-    """C(1), C(-1), their difference and the first moment of one order α, for either memory. `alpha` is a scalar."""
+    """C(1), C(-1), their difference and the first moment for one order α, with either memory. `alpha` is a scalar."""
     if span.memory == "short":
         return _gl_sums(alpha, span.N) if on_host(alpha) else gl_sums(alpha, span.N)
     alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha))
@@ -51,7 +51,7 @@ def sums(alpha: Real[ArrayLike, ""], span: Span) -> GLSums:
 
 
 def response(alpha: Real[ArrayLike, ""], angle: Real[Array, "*w"], span: Span) -> Complex[Array, "*w"]:
-    """C(e^{jθ}) at angles θ = ωT (rad per sample), by positive partial sums: no digit is lost towards θ = 0.
+    """C(e^{jθ}) at angles θ = ωT (rad per sample), from positive partial sums without cancellation near θ = 0.
 
     `alpha` is a scalar, `angle` of any shape -> complex, the same shape.
     """
@@ -67,7 +67,7 @@ def response(alpha: Real[ArrayLike, ""], angle: Real[Array, "*w"], span: Span) -
 def _short_response(
     alpha: Scalar, angle: Float[Array, "*w"], difference: Complex[Array, "*w"], N: int
 ) -> Complex[Array, "*w"]:
-    """C as (1 - z^{-1})·Σ_{i<N} S_i z^{-i} + S_N z^{-N}; `difference` is 1 - z^{-1}."""
+    """C of short memory as (1 - z^{-1})·Σ_{i<N} S_i z^{-i} + S_N z^{-N}; `difference` is 1 - z^{-1}."""
     delay = jax.lax.complex(jnp.cos(angle), -jnp.sin(angle))
 
     def add(carry, i):
@@ -81,7 +81,7 @@ def _short_response(
 
 @partial(jax.jit, static_argnames="N")
 def gl_coefficients(alpha: Real[ArrayLike, ""], N: int) -> Float[Array, " {N+1}"]:
-    """Coefficients c_0 … c_N of one order α; `jax.vmap` over `alpha` for several. -> (N + 1,), without unit."""
+    """Coefficients c_0 … c_N of one order α; `jax.vmap` over `alpha` for several. -> (N + 1,), dimensionless."""
     alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha))
     _, tail = jax.lax.scan(partial(_tap, alpha), jnp.ones_like(alpha), _indices(alpha, N))
     return jnp.concatenate([jnp.ones(1, alpha.dtype), -tail])
@@ -89,16 +89,16 @@ def gl_coefficients(alpha: Real[ArrayLike, ""], N: int) -> Float[Array, " {N+1}"
 
 @partial(jax.jit, static_argnames="N")
 def gl_sums(alpha: Real[ArrayLike, ""], N: int) -> GLSums:
-    """C(1), C(-1), their difference and the first moment of one order α, without cancellation. `alpha` is a scalar."""
+    """C(1), C(-1), their difference and the first moment for one order α and short memory. `alpha` is a scalar."""
     return _gl_sums_jet(jnp.asarray(alpha, jnp.result_type(1.0, alpha)), N, 0)[0]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))
 def _gl_sums_jet(alpha: Scalar, N: int, order: int) -> tuple[GLSums, ...]:
-    """The sums and their derivatives by α up to that order, in one loop, however many directions α moves in.
+    """The sums and their derivatives by α up to `order`, computed in one loop.
 
-    Without this rule a Hessian carries every direction through the N additions, at ten times the time; and the rule
-    below asks for one longer jet in place of one loop for each order.
+    This custom rule makes a Hessian about ten times faster: all directions share the loop over N, and a derivative
+    extends the jet by one order instead of adding a loop.
     """
     jet = _first_of_jet(partial(_gl_sums, N=N))
     for _ in range(order):
@@ -108,17 +108,18 @@ def _gl_sums_jet(alpha: Scalar, N: int, order: int) -> tuple[GLSums, ...]:
 
 @_gl_sums_jet.defjvp
 def _gl_sums_jet_jvp(N, order, primals, tangents):
+    """Derivative rule of `_gl_sums_jet`: the jet one order longer, times the tangent."""
     longer = _gl_sums_jet(*primals, N, order + 1)
     return longer[:-1], jax.tree.map(lambda slope: slope * tangents[0], longer[1:])
 
 
 def _first_of_jet(function: Callable) -> Callable:
-    """The jet of order 0: the values alone."""
+    """Jet of order 0: the values alone."""
     return lambda alpha: (function(alpha),)
 
 
 def _longer(jet: Callable) -> Callable:
-    """The jet with one derivative more."""
+    """Jet with one more derivative."""
 
     def extended(alpha):
         values, slopes = jax.jvp(jet, (alpha,), (jnp.ones_like(alpha),))
@@ -128,7 +129,7 @@ def _longer(jet: Callable) -> Callable:
 
 
 def _gl_sums(alpha: Number, N: int) -> GLSums:
-    """The sums in one loop over the taps."""
+    """The sums for short memory, accumulated in one loop over the taps."""
     xp = namespace_of(alpha)
 
     def add(sums, i):
@@ -146,7 +147,7 @@ def _gl_sums(alpha: Number, N: int) -> GLSums:
 
 
 def _tap(alpha: Number, partial_sum: Number, i: Number) -> tuple[Number, Number]:
-    """From S_{i-1} to S_i and |c_i|."""
+    """S_i and |c_i| from S_{i-1}."""
     return partial_sum * (1 - alpha / i), alpha / i * partial_sum
 
 

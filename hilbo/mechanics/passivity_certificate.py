@@ -1,4 +1,4 @@
-"""Is a parameter set passive on a device? A certificate without gaps between frequencies; a motion that proves a no.
+"""Passivity of a parameter set on a device: rigorous bounds over all frequencies, and a counterexample in time.
 
 With θ = ωT a rendering needs the damping (T/2)·φ(θ), φ = Re H - cot(θ/2)·Im H, and H(1) >= 0. In the terms of
 `response_polynomials`
@@ -6,14 +6,14 @@ With θ = ωT a rendering needs the damping (T/2)·φ(θ), φ = Re H - cot(θ/2)
     p = (Y - φ)·A = (Y - K0)·A - B
 
 is a cosine polynomial of degree N, finite for every K1 from 0 to inf. Where p >= 0 everywhere, the damping (T/2)·Y is
-enough. `cosine_polynomials` bounds p from below without gaps. The result is an enclosure of the smallest passive
-damping, for even N as well as odd. A force that is late needs (T/2)·Y(θ) of `delay`, enclosed by `delayed_enclosure`.
+sufficient. `cosine_polynomials` bounds p from below over all angles. The result is an enclosure of the smallest passive
+damping, for even N as well as odd. A delayed force needs (T/2)·Y(θ) of `delay`, enclosed by `delayed_enclosure`.
 
-With full memory the Nyquist frequency binds (docs/methods/mechanics.md), and b_min is closed.
+With full memory the Nyquist frequency binds (docs/methods/mechanics.md), and b_min has a closed form.
 
 A violation is shown in time, by a path that loses least in the device's damping. The force is held, so that between
-samples the path is straight, and a cycle takes up the energy Σ F_n·Δx_n + b·Δx_n²/T: negative if it creates energy. A
-late force changes between the samples, and there the path has a bend.
+samples the path is straight, and a cycle absorbs the energy Σ F_n·Δx_n + b·Δx_n²/T: negative if it creates energy. A
+delayed force changes between the samples, and there the path has a bend.
 
 Units: damping N·s/m, ω rad/s, x mm, F N, energy mJ (N·mm). Reference: Colgate and Schenkel (1997), J. Robotic Syst. 14,
 37-47.
@@ -50,7 +50,7 @@ _LONGEST_CYCLE = 4096  # samples
 
 
 class Certificate(eqx.Module):
-    """What `certify` knows: bounds of the margin b - b_min, the static stiffness, and where the margin is smallest."""
+    """Bounds of the passivity margin b - b_min, static stiffness, and frequency at which the margin is smallest."""
 
     lower: Number  # N·s/m
     upper: Number  # N·s/m
@@ -63,42 +63,42 @@ class Certificate(eqx.Module):
 
     @property
     def passive(self) -> Bool[Any, "..."]:
-        """Proved: enough damping at every frequency, and H(1) >= 0."""
+        """Whether passivity is proved: sufficient damping at every frequency, and H(1) >= 0."""
         return (self.lower > 0) & (self.static_stiffness >= 0)
 
     @property
     def violated(self) -> Bool[Any, "..."]:
-        """Proved: too little damping at `frequency`, or H(1) < 0."""
+        """Whether a violation is proved: too little damping at `frequency`, or H(1) < 0."""
         return (self.upper <= 0) | (self.static_stiffness < 0)
 
     @property
     def status(self) -> str:
-        """One word, for one set: passive, violated, or undecided where the margin is 0 to rounding."""
+        """Result for one set: "passive", "violated", or "undecided" if the margin is 0 within rounding."""
         return "passive" if self.passive else "violated" if self.violated else "undecided"
 
 
 class Witness(eqx.Module):
-    """A cycle that creates energy: `x` (mm) at its n + 1 samples, forces (N) that follow the first n, energies (mJ).
+    """Cycle that creates energy: `x` (mm) at its n + 1 samples, forces (N) of the first n, energies (mJ).
 
-    Each force is held for T from `delay` (s) after its sample. There x is `bend` (mm), and straight in between.
+    Each force is held for T from `delay` (s) after its sample, when x is `bend` (mm); x is linear in between.
     """
 
     force: Float[np.ndarray, " n"]
     x: Float[np.ndarray, " n+1"]
     bend: Float[np.ndarray, " n"]
-    frequency: float  # rad/s; a cycle may hold several periods of it
-    lost: float  # in the device's damping, >= 0
-    energy: float  # taken up by device and rendering together, < 0
+    frequency: float  # rad/s; a cycle may contain several periods
+    lost: float  # dissipated in the device's damping, >= 0
+    energy: float  # absorbed by device and rendering together, < 0
     delay: float
 
 
 def needed_damping(
     model: FOSLS, omega: Real[ArrayLike, "*w"], *, delay: Real[ArrayLike, ""] = 0.0
 ) -> Float[Array, "*w"]:
-    """The damping (N·s/m) that passivity asks for at each ω in [0, π/T] (rad/s); at 0 the limit, without `delay`
-    H(1)·T/2 - B_eff.
+    """Damping (N·s/m) needed for passivity at each ω in [0, π/T] (rad/s).
 
-    `delay`: from a sample of the position to its force, s. `omega` of any shape -> the same shape.
+    At ω = 0 the limit, which is H(1)·T/2 - B_eff without `delay`. `delay`: from a sample of the position to its force,
+    s. `omega` of any shape -> the same shape. Raises `InputError` for a delay outside 0 to T.
     """
     late = check_delay(delay, model.T)
     angle = jnp.asarray(omega, model.K0.dtype) * model.T
@@ -109,22 +109,21 @@ def needed_damping(
     stiffness = response.real - response.imag / jnp.tan(safe / 2)
     if not late:
         return jnp.where(moving, 500 * model.T * stiffness, 500 * model.T * model.dc_gain() - model.effective_damping())
-    lag, still = delay / model.T, model.dc_gain()
+    lag, static = delay / model.T, model.dc_gain()
     turned = jnp.cos(safe) * response.real + jnp.sin(safe) * response.imag
-    slow = still * (1 + 2 * lag) - model.effective_damping() / (500 * model.T)
+    slow = static * (1 + 2 * lag) - model.effective_damping() / (500 * model.T)
     psi = jnp.where(moving, stiffness + 2 * lag * turned, slow)
-    square = jnp.where(moving, response.real**2 + response.imag**2, still**2)
+    square = jnp.where(moving, response.real**2 + response.imag**2, static**2)
     return 500 * model.T * larger_root(psi, lag * (1 - lag) * square)
 
 
 def certify(model: FOSLS, b: Real[ArrayLike, ""], *, delay: Real[ArrayLike, ""] = 0.0) -> Certificate:
-    """Whether the rendering is passive on a device with physical damping `b` (N·s/m); `jax.vmap` for several.
+    """Certify whether the rendering is passive on a device with physical damping `b` (N·s/m); `jax.vmap` for several.
 
     `delay`: from a sample of the position to its force, s, 0 to T. For any N. With full memory and a delay the bounds
     are an estimate to a relative 1e-6, not proved. Not differentiable: see `minimum_damping`, and `needed_damping` at
-    the certificate's frequency.
-    `b` is a scalar; so is every number of the certificate. Of a model of NumPy's numbers it is computed by NumPy.
-    Raises `InputError` for a `b` below 0 and for another delay.
+    the certificate's frequency. `b` is a scalar, as is every number of the certificate. For a model of NumPy numbers it
+    is computed by NumPy. Raises `InputError` for a `b` below 0 and for a delay outside its range.
     """
     if concrete(b) and not np.all(np.asarray(b) >= 0):
         raise InputError(f"b is {shown(b)}; the damping of a device is 0 or above, in N.s/m.")
@@ -140,38 +139,43 @@ def certify(model: FOSLS, b: Real[ArrayLike, ""], *, delay: Real[ArrayLike, ""] 
 
 @program
 def _certify(model: FOSLS, b: Real[ArrayLike, ""]) -> Certificate:
+    """Compute the certificate without delay in JAX."""
     return _certificate(jax.lax.stop_gradient(model), jnp.asarray(b, model.K0.dtype))
 
 
 @program
 def _certify_late(model: FOSLS, b: Scalar, delay: Scalar) -> Certificate:
+    """Compute the certificate with delay in JAX."""
     return _late_certificate(jax.lax.stop_gradient(model), b, jax.lax.stop_gradient(delay))
 
 
 def _certificate(model: FOSLS, b: Number) -> Certificate:
+    """Certificate without delay."""
     enclose = _full_enclosure if model.memory == "full" else _short_enclosure
     return _with_margin(model, b, *enclose(model))
 
 
 def _late_certificate(model: FOSLS, b: Number, delay: Number) -> Certificate:
+    """Certificate with a delay (s)."""
     enclose = full_estimate if model.memory == "full" else short_enclosure
     return _with_margin(model, b, *enclose(model, delay / model.T))
 
 
 def _with_margin(model, b, low, high, angle) -> Certificate:
+    """Certificate from bounds `low`, `high` (N/mm) of max φ or Y and the angle of the maximum."""
     scale = 500 * model.T
     return Certificate(b - scale * high, b - scale * low, model.dc_gain(), angle / model.T)
 
 
 def _full_enclosure(model: FOSLS) -> tuple[Scalar, Scalar, Scalar]:
-    """As `_short_enclosure`, for full memory: the Nyquist frequency binds, and only rounding is open."""
+    """Counterpart of `_short_enclosure` for full memory: the value at the Nyquist frequency -/+ its rounding error."""
     stiffness = model.high_frequency_gain()
     error = 4 * jnp.finfo(stiffness.dtype).eps * stiffness
     return stiffness - error, stiffness + error, jnp.asarray(jnp.pi, stiffness.dtype)
 
 
 def _short_enclosure(model: FOSLS) -> tuple[Number, Number, Number]:
-    """Bounds of max φ over all angles, and the angle of the largest φ found."""
+    """Lower and upper bound of max φ (N/mm) over all angles, and the angle of the maximum found."""
     A, B, least_A, *_ = parts_of(model)
     xp = namespace_of(A)
     cells = cells_for(model.N)
@@ -188,17 +192,17 @@ def _short_enclosure(model: FOSLS) -> tuple[Number, Number, Number]:
 
 
 def _ratio(A: Coefficients, B: Coefficients, angle: Number) -> tuple[Number, Number, Number]:
-    """B/A, with the slope and bend of (B/A)·A - B for the number B/A, per 1/N."""
+    """B/A at an angle, with slope and second derivative of (B/A)·A - B for this value, per 1/N."""
     a, b = (at_angles(rows(p, 3), angle[None])[:, 0] for p in (A, B))
     value = b[0] / a[0]
     return value, value * a[1] - b[1], 2 * (value * a[2] - b[2])
 
 
 def witness(model: FOSLS, b: float, *, delay: float = 0.0) -> Witness | None:
-    """A motion that creates energy with a rendering that `certify` calls violated for lack of damping; None for others.
+    """Construct a motion that creates energy with a rendering whose damping `certify` proves too low; None for others.
 
-    x has amplitude 1 mm. For full memory too. A set that is violated by H(1) < 0 alone needs no cycle: drawn slowly
-    from x = 0 to x it gives back ½·|H(1)|·x².
+    x has amplitude 1 mm. For full memory too. A set that violates H(1) >= 0 alone needs no cycle: pulled slowly from x
+    = 0 to x it releases ½·|H(1)|·x².
     """
     certificate = certify(model, b, delay=delay)
     if not bool(certificate.upper <= 0):
@@ -207,7 +211,7 @@ def witness(model: FOSLS, b: float, *, delay: float = 0.0) -> Witness | None:
     turns = Fraction(angle / (2 * math.pi)).limit_denominator(_LONGEST_CYCLE)
     n = turns.denominator
     y = np.exp(2j * np.pi * turns.numerator / n * np.arange(n))
-    # Driven by the pot's elongation y, which may start anywhere: x and F follow from it without a transient.
+    # Driven by the spring-pot's elongation y: x and F follow from it without a transient.
     pot = float(model.beta) * _fractional(model, y)
     compliance = 0.0 if math.isinf(model.K1) else 1 / float(model.K1)
     x = y + compliance * pot
@@ -223,7 +227,10 @@ def witness(model: FOSLS, b: float, *, delay: float = 0.0) -> Witness | None:
 
 
 def _late_witness(model, b, delay, force, x, frequency, needed) -> Witness:
-    """The cycle whose bends lose least in the damping that the set needs: with less it creates energy all the more."""
+    """Witness with a delay: the cycle whose bends lose least in the damping that the set needs.
+
+    With less damping the same cycle creates even more energy.
+    """
     before = np.roll(force, 1)
     mean, change = np.diff(x) / model.T, (force - before) / (2 * needed / 1000)  # mm/s
     rest = model.T - delay
@@ -234,7 +241,7 @@ def _late_witness(model, b, delay, force, x, frequency, needed) -> Witness:
 
 
 def _fractional(model: FOSLS, y: Complex[np.ndarray, " n"]) -> Complex[np.ndarray, " n"]:
-    """Σ c_i y_{n-i} of a periodic y, by the taps or the exponentials themselves."""
+    """Σ c_i y_{n-i} of a periodic y, by the taps or the exponentials."""
     if model.memory == "short":
         c = np.asarray(gl_coefficients(model.alpha, model.N))
         return sum((c[i] * np.roll(y, i) for i in range(len(c))), np.zeros_like(y))

@@ -1,4 +1,4 @@
-"""Valid ranges of the numbers of models and devices: an error for concrete values, NaN for traced ones."""
+"""Valid ranges of model and device parameters: an error for known values, NaN for traced ones."""
 
 import functools
 import operator
@@ -30,17 +30,17 @@ RANGES = {
     "alpha": (lambda v: (v > 0) & (v <= 1), "above 0 and at most 1: the order of the fractional element"),
     "T": (lambda v: (v > 0) & (v < np.inf), "a number of seconds above 0"),
     "t": _FROM_0,
-    "K0": _FROM_0,  # where it is the static stiffness
+    "K0": _FROM_0,  # with full memory, where it is the static stiffness
     "K1": _FROM_0,
     "B1": _FINITE,
     "b": _FROM_0,
     "delay": _FINITE,
 }
-"""Name -> whether values are allowed, elementwise; and what they must be, in words."""
+"""Name -> elementwise test of the values, and the requirement in words."""
 
 
 def check_ranges(**values: Reals) -> None:
-    """Raise `InputError` for values out of range. Tracers are not checked."""
+    """Raise `InputError` for the first value outside the range of its name; traced values are not checked."""
     for name, value in values.items():
         allowed, words = RANGES[name]
         if concrete(value) and not np.all(fine := allowed(np.asarray(value, float))):
@@ -49,5 +49,5 @@ def check_ranges(**values: Reals) -> None:
 
 
 def possible(**values: Any) -> Bool[Array, "..."]:
-    """Whether all values are in range, elementwise; also of tracers."""
+    """Whether all values are within the ranges of their names, elementwise; also for traced values."""
     return functools.reduce(operator.and_, (RANGES[name][0](value) for name, value in values.items()))

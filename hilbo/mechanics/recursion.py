@@ -1,12 +1,13 @@
-"""One history driven by one input: y_n = a·u_n + ρ·s_n, where s_n is what the past of y contributes.
+"""Recursion of the FO-SLS history: y_n = a·u_n + ρ·s_n, where s_n is the contribution of the past of y.
 
-Position and force drive the FO-SLS through the same recursion, with another a and ρ (see `viscoelastic`). With c_0 = 1
+Position and force drive the FO-SLS through the same recursion, with different a and ρ (see `viscoelastic`). With c_0 =
+1
 
     short memory:  s_n = Σ_{i=1..N} |c_i|·y_{n-i}                          state: the last N values of y
     full memory:   s_n = Σ_k p_k·m_k,  m_k <- λ_k·m_k + (1 - λ_k)·y_{n-1}  state: one fading mean for each exponential
 
-Both are linear, so that m samples are two matrix products: with the impulse response d of 1/(1 - ρ·Σ|c_i|z^{-i}),
-its lower triangular Toeplitz matrix D, and the rows M that carry the state at the start of a block on to each sample,
+Both are linear, so that m samples are two matrix products: with the impulse response d of 1/(1 - ρ·Σ|c_i|z^{-i}), its
+lower triangular Toeplitz matrix D, and the rows M that propagate the state at the start of a block to each sample,
 
     s = D·M·state + (D - 1)/ρ · a·u,
 
@@ -29,14 +30,14 @@ from hilbo.mechanics.span import Span
 __all__ = ["BLOCK", "past_of"]
 
 BLOCK = 32
-"""Samples at once."""
+"""Samples per block."""
 
 
 class _History(NamedTuple):
-    """What a block of m samples needs of a memory with a state of s numbers."""
+    """Block form of a memory whose state has s numbers, for blocks of m samples."""
 
     taps: Float[Array, " m"]  # |c_1| … |c_m|
-    carry: Float[Array, "m s"]  # how the state acts on each sample
+    carry: Float[Array, "m s"]  # contribution of the state to each sample
     write: Callable[[Array, Array], Array]  # the next state, from the state and y of the block
     state: Float[Array, " s"]  # before the first block
 
@@ -44,9 +45,9 @@ class _History(NamedTuple):
 def past_of(
     alpha: Scalar, gain: Scalar, feedback: Scalar, u: Float[Array, " n"], before: Scalar, span: Span, block: int = BLOCK
 ) -> Float[Array, " n"]:
-    """s_n at every sample, for a history that has been at y = `before` for ever.
+    """Contribution s_n of the past at every sample, for a history that has been at y = `before` since -∞.
 
-    `gain` is a, `feedback` is ρ. `block` changes nothing but speed and rounding; 1 is the plain recursion.
+    `gain` is a, `feedback` is ρ. `block` affects only speed and rounding; 1 is the plain recursion.
     """
     blocks = -(-u.shape[0] // block)
     driven = gain * jnp.zeros(blocks * block, u.dtype).at[: u.shape[0]].set(u).reshape(blocks, block)
@@ -65,7 +66,7 @@ def past_of(
 
 
 def _taps(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
-    """Short memory: the state is the last values of y, the newest last."""
+    """Block form of short memory: the state is the last values of y, the newest last."""
     N, length = span.N, max(span.N, block)
     taps = jnp.zeros(length + block, alpha.dtype).at[:N].set(-gl_coefficients(alpha, N)[1:])
     delay = jnp.arange(block)[:, None] + length - jnp.arange(length)[None, :]
@@ -77,7 +78,7 @@ def _taps(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
 
 
 def _means(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
-    """Full memory: the state is one mean for each exponential, |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1}."""
+    """Block form of full memory: the state is one mean for each exponential, |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1}."""
     weight, loss = exponentials(alpha, span.states)
     # As products, which have derivatives at λ = 0.
     powers = jnp.cumprod(jnp.concatenate([jnp.ones_like(loss)[None], jnp.tile(1 - loss, (block - 1, 1))]), axis=0)
@@ -91,7 +92,7 @@ def _means(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
 
 
 def _impulse(taps: Float[Array, " m"], feedback: Scalar) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """d_0 … d_{m-1}, and (d - 1)/ρ = Σ |c_i| d_{j-i}, which is the echo of an input in s."""
+    """Impulse response d_0 … d_{m-1}, and (d - 1)/ρ = Σ |c_i| d_{j-i}, the response of s to an input."""
 
     def add(backwards, _):
         echo = taps @ backwards
@@ -104,7 +105,7 @@ def _impulse(taps: Float[Array, " m"], feedback: Scalar) -> tuple[Float[Array, "
 
 
 def _toeplitz(column: Float[Array, " m"]) -> Float[Array, "m m"]:
-    """Lower triangular matrix with this first column."""
+    """Lower triangular Toeplitz matrix with this first column."""
     size = column.shape[0]
     delay = jnp.arange(size)[:, None] - jnp.arange(size)[None, :]
     return jnp.where(delay >= 0, column[jnp.maximum(delay, 0)], 0)

@@ -1,4 +1,4 @@
-"""The response of an FO-SLS with short memory as cosine polynomials: C and H times what makes them finite.
+"""Frequency response of an FO-SLS with short memory as cosine polynomials, after multiplication by a denominator A.
 
 With g = K1/(K1 + β), h = 1 - g and k = K1·β/(K1 + β) the response is H = K0 + k·C/(g + h·C), and times A = |g + h·C|²
 
@@ -6,7 +6,7 @@ With g = K1/(K1 + β), h = 1 - g and k = K1·β/(K1 + β) the response is H = K0
     Re(e^{-jθ}·H)           is    cos θ·(K0·A + k·h·|C|²) + k·g·Re(e^{-jθ}·C)
     |H|²                    is    |K0·g + (K0·h + k)·C|²
 
-where V = Re C - cot(θ/2)·Im C = S_N - 2·Σ_{j=1..N} (S_{j-1} - S_N)·cos jθ. NumPy's numbers are computed by NumPy.
+where V = Re C - cot(θ/2)·Im C = S_N - 2·Σ_{j=1..N} (S_{j-1} - S_N)·cos jθ. NumPy inputs are computed by NumPy.
 """
 
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ __all__ = ["Parts", "parts_of", "square_of", "turned_of"]
 
 
 class Parts(NamedTuple):
-    """Cosine coefficients of degree N, and g, h, k of this module's head."""
+    """Cosine coefficients of degree N, and g, h, k as in the module docstring."""
 
     A: Coefficients
     B: Coefficients
@@ -34,7 +34,7 @@ class Parts(NamedTuple):
 
 
 def parts_of(model: FOSLS) -> Parts:
-    """A and B of a model, and what they are made of."""
+    """Polynomials A and B of a model, with their components."""
     beta = model.beta
     xp = namespace_of(model.alpha)
     k = series(model.K1, beta)
@@ -53,7 +53,7 @@ def parts_of(model: FOSLS) -> Parts:
 
 
 def turned_of(parts: Parts, K0: Number) -> Float[Any, " m"]:
-    """Cosine coefficients of Re(e^{-jθ}·H)·A, one more than those of A."""
+    """Cosine coefficients of Re(e^{-jθ}·H)·A, one degree higher than A."""
     xp = namespace_of(parts.A)
     zero = xp.zeros(1, parts.A.dtype)
     late = xp.concatenate([zero, parts.C])  # Re(e^{-jθ}·C)
@@ -66,6 +66,6 @@ def turned_of(parts: Parts, K0: Number) -> Float[Any, " m"]:
 def square_of(parts: Parts, K0: Number) -> Coefficients:
     """Cosine coefficients of |H|²·A."""
     xp = namespace_of(parts.A)
-    still, moving = K0 * parts.g, K0 * parts.h + parts.k
-    p = moving**2 * parts.square + 2 * still * moving * parts.C
-    return xp.concatenate([p[:1] + still**2, p[1:]])
+    constant, slope = K0 * parts.g, K0 * parts.h + parts.k
+    p = slope**2 * parts.square + 2 * constant * slope * parts.C
+    return xp.concatenate([p[:1] + constant**2, p[1:]])

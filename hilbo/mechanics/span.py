@@ -1,6 +1,6 @@
-"""How far a sampled model looks back: past samples (short memory), or exponentials that stand for all of them (full).
+"""Memory of a sampled model: number of past samples (short memory), or of exponentials that replace them (full memory).
 
-Loads no JAX: study files and devices name a memory where nothing is computed.
+Imports no JAX, so that study files and devices can specify a memory without it.
 """
 
 from typing import Literal, NamedTuple
@@ -9,11 +9,11 @@ __all__ = ["STATES", "Memory", "Span", "span"]
 
 Memory = Literal["short", "full"]
 STATES = (8, 10, 12)
-"""Numbers of exponentials to choose from."""
+"""Supported numbers of exponentials."""
 
 
 class Span(NamedTuple):
-    """How far a model looks back: `N` taps (short memory), or `states` exponentials (full memory)."""
+    """Memory of a model: `N` taps (short memory), or `states` exponentials (full memory)."""
 
     memory: Memory
     N: int
@@ -21,7 +21,10 @@ class Span(NamedTuple):
 
 
 def span(memory: Memory, N: int, states: int = 10) -> Span:
-    """The memory of a model, checked. The number that does not apply is 0, so that it compiles nothing anew."""
+    """Check and return the memory of a model; the number that does not apply is set to 0, to avoid recompilation.
+
+    Raises ValueError for values out of range.
+    """
     if memory not in ("short", "full"):
         raise ValueError(f'memory is {memory!r}; it must be "short" (N taps) or "full" (exponentials).')
     if memory == "short" and N < 1:

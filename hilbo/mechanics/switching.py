@@ -1,14 +1,14 @@
-"""Changing the parameter set while the device is in contact.
+"""Change of the parameter set while the device is in contact.
 
-A history cannot be handed over: cleared, the force jumps by newtons, and no factor on it is right in motion. So the new
-set runs a history of its own on the same positions from the moment it is staged; once that is warm, the force flips to
-it, with the difference d of the two forces added and then taken back at a bounded rate:
+The history of one set is no valid history of another: clearing it makes the force jump by newtons, and rescaling it is
+wrong in motion. So the new set runs a history of its own on the same positions from the moment it is staged; once that
+is filled, the force switches to it, with the difference d of the two forces added and then reduced at a bounded rate:
 
     F_n = F_old,n                                          n < flip
     F_n = F_new,n + sign(d)·max(|d| - slew·T·(n - flip), 0)    n >= flip,  d = F_old - F_new at the flip
 
-The passivity conditions cover no switch: where it can be, switch out of contact, with a cleared history.
-Units: mm, N, slew N/s.
+The passivity conditions cover no switch: where possible, switch out of contact, with a cleared history. Units: mm, N,
+slew N/s.
 """
 
 import jax.numpy as jnp
@@ -24,11 +24,10 @@ __all__ = ["switched_force"]
 def switched_force(
     old: FOSLS, new: FOSLS, x: Real[ArrayLike, " n"], *, staged: int, flip: int, slew: float
 ) -> Float[Array, " n"]:
-    """Force (N) along positions `x` (mm) when `new` is staged at one sample and takes over at another.
+    """Force (N) along positions `x` (mm) when `new` is staged at sample `staged` and takes over at sample `flip`.
 
     The new history starts as if x[staged] had been held for ever. Raises InputError for samples out of order or of
-    range, a `slew` (N/s) that is not above 0, and sets for different sampling times.
-    `x` (n,) -> (n,).
+    range, a `slew` (N/s) that is not above 0, and sets for different sampling times. `x` (n,) -> (n,).
     """
     x = jnp.asarray(x, old.K0.dtype)
     if not 0 <= staged <= flip < x.shape[0]:

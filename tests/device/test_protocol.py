@@ -139,7 +139,7 @@ def test_a_receiver_holds_one_frame_at_most():
     receiver = Receiver()
     for _ in range(1000):
         assert receiver.feed(b"\x05garbage") == []
-    assert len(receiver._held) <= LONGEST + 1
+    assert len(receiver._buffer) <= LONGEST + 1
     assert [frame.seq for frame in receiver.feed(b"\0" + encode(protocol.Stop(), 9))] == [9]
     assert receiver.dropped == 1
 
