@@ -53,10 +53,9 @@ _SHAPES = {"hold": 0, "triangle": 1, "step": 2, "nudge": 3}
 class Renderer:
     """Connected device; `device` is its description (`HelloReply`), `notes` are messages for the user.
 
-    `simulator` is the `Simulator` behind a simulated device, else None.
-
-    Construct with `open`. Every method raises `RefusalError` (an `InputError`) for numbers the device refuses, and
-    `DeviceError` when device or line fail, each with one sentence on what to do.
+    `simulator` is the `Simulator` behind a simulated device, else None. Construct with `open`. Every method raises
+    `RefusalError` (an `InputError`) for numbers the device refuses, and `DeviceError` when device or line fail, each
+    with one sentence on what to do.
     """
 
     def __init__(
@@ -330,10 +329,7 @@ class Renderer:
         return self.samples(seconds).table(self.tick_s)
 
     def samples(self, seconds: SupportsFloat = 1.0) -> Samples:
-        """Telemetry as in `telemetry`, as arrays (n,) instead of a pandas table.
-
-        Raises `DeviceError` if the line is lost or no telemetry comes.
-        """
+        """Telemetry and errors as of `telemetry`, as arrays (n,) instead of a pandas table."""
         if not math.isfinite(float(seconds)):
             raise InputError(f"The time is {seconds} s; give a number.")
         buffer, quiet, ticks = self._buffer, 0, float(seconds) / self.tick_s
