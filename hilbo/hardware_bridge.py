@@ -26,14 +26,14 @@ from hilbo.device.failures import DeviceError, RefusalError
 from hilbo.device.handshake import greet, take_over
 from hilbo.device.link import Link
 from hilbo.device.messages import Status
-from hilbo.device.parameter_sets import InForce, in_force, wanted_for
+from hilbo.device.parameter_sets import InForce, ParameterSet, in_force
 from hilbo.device.ports import BAUD, list_ports, open_port
 from hilbo.device.reasons import Capability, NackReason, State, held_because, meaning
 from hilbo.device.staging import put_in_force, retry_while_busy
 from hilbo.device.telemetry import Counts, Samples, TelemetryBuffer, joined
 from hilbo.errors import InputError
 
-__all__ = ["Capability", "DeviceError", "InForce", "RefusalError", "Renderer", "State", "list_ports"]
+__all__ = ["Capability", "DeviceError", "InForce", "ParameterSet", "RefusalError", "Renderer", "State", "list_ports"]
 
 
 def __dir__() -> list[str]:
@@ -160,30 +160,17 @@ class Renderer:
             self._link.close()
             raise
 
-    def send(
-        self,
-        *,
-        K0: SupportsFloat,
-        K1: SupportsFloat,
-        B1: SupportsFloat,
-        alpha: SupportsFloat,
-        N: int = 101,
-        T: SupportsFloat = 1e-3,
-        memory: str = "short",
-        states: int = 10,
-        force_limit: SupportsFloat | None = None,
-        wait: SupportsFloat = 5.0,
-    ) -> InForce:
+    def send(self, wanted: ParameterSet | None = None, /, *, wait: SupportsFloat = 5.0, **values: Any) -> InForce:
         """Put a parameter set in force: stage, commit, read back and compare bit for bit.
 
-        In contact the device first fills the history of the new set; `wait` (s) is the timeout for that. `force_limit`
-        (N): the device's own by default. A set that is in force already is not sent again. K0, K1 in N/mm, B1 in
-        N·s^α/mm, T in s. Raises `InputError` for numbers that do not fit and for a set that the device refuses,
-        `DeviceError` if the line fails.
+        Either a `ParameterSet`, or its fields as `values`: K0, K1 in N/mm, B1 in N·s^α/mm, alpha, and optionally N, T
+        in s, memory, states, and force_limit in N. In contact the device first fills the history of the new set; `wait`
+        (s) is the timeout for that. A set that is in force already is not sent again.
+        Raises `InputError` for numbers that do not fit and for a set that the device refuses, `DeviceError` if the
+        line fails.
         """
-        numbers = {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "N": N, "T": T, "memory": memory, "states": states}
-        wanted = wanted_for(self.device, **numbers, force_limit=force_limit)
-        return put_in_force(self._link, self.device, wanted, float(wait))
+        messages = (ParameterSet(**values) if wanted is None else wanted).messages(self.device)
+        return put_in_force(self._link, self.device, messages, float(wait))
 
     def in_force(self) -> InForce | None:
         """Parameter set in force; None if there is none."""

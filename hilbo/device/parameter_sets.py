@@ -7,15 +7,15 @@ import math
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, SupportsFloat
+from dataclasses import dataclass
+from typing import Any, NamedTuple, SupportsFloat
 
 from hilbo.device.messages import Exponential, HelloReply, Set, SetParams, SetStates
 from hilbo.device.protocol import payload_of
 from hilbo.errors import InputError
 from hilbo.mechanics.span import STATES
 
-__all__ = ["InForce", "ParameterSet", "crc_of", "differences", "in_force", "wanted_for"]
+__all__ = ["InForce", "ParameterSet", "crc_of", "differences", "in_force"]
 
 _PER_MESSAGE = 7  # exponentials
 _WIRE_NAMES = {
@@ -32,10 +32,55 @@ _WIRE_NAMES = {
 class ParameterSet:
     """Parameter set to be rendered by a device.
 
-    K0, K1 in N/mm, B1 in N·s^α/mm, `force_limit` in N. `memory` is "short" or "full"; `length` is N of short memory, or
-    the number of exponentials of full memory.
+    K0, K1 in N/mm, B1 in N·s^α/mm, T in s, `force_limit` in N (None: the device's own). `memory`: "short", of N
+    samples, or "full", of `states` exponentials.
     """
 
+    K0: SupportsFloat
+    K1: SupportsFloat
+    B1: SupportsFloat
+    alpha: SupportsFloat
+    N: int = 101
+    T: SupportsFloat = 1e-3
+    memory: str = "short"
+    states: int = 10
+    force_limit: SupportsFloat | None = None
+
+    def messages(self, device: HelloReply) -> list[SetParams | SetStates]:
+        """SET_PARAMS message for a device, followed for full memory (which loads JAX) by SET_STATES; not yet numbered.
+
+        Raises `InputError` for values that are no numbers or cannot be sent.
+        """
+        rate = device.tick_rate_Hz
+        if not abs(rate * _number("T", self.T) - 1) < 1e-9:
+            raise InputError(
+                f"T is {self.T} s and the device's tick {1 / rate!r} s; a set belongs to its T, choose another."
+            )
+        limit = device.force_limit_N if self.force_limit is None else self.force_limit
+        given = {"force_limit": limit} | {name: getattr(self, name) for name in ("K0", "K1", "B1", "alpha")}
+        numbers = {name: _number(name, value) for name, value in given.items()}
+        if self.memory not in ("short", "full"):
+            raise InputError(f'memory is "{self.memory}"; it must be "short" or "full".')
+        for name, value in numbers.items():
+            if not math.isfinite(value) or abs(value) > 3e38:
+                raise InputError(f"{name} is {value}; it must be a finite number.")
+        full = self.memory == "full"
+        length = self.states if full else self.N
+        if not 0 <= length < 2**16:
+            raise InputError(f"N (or states) is {length}; it must be a number of samples (or exponentials).")
+        wire: dict[str, Any] = {_WIRE_NAMES[name]: value for name, value in numbers.items()}
+        head = SetParams(set_id=0, memory=int(full), length=length, tick_rate_Hz=rate, **wire)
+        return [head, *(_states(numbers["alpha"], length) if full else [])]
+
+
+class InForce(NamedTuple):
+    """Parameter set in force on a device, rounded to binary32; units as in `ParameterSet`.
+
+    `length`: N of short memory, or the number of exponentials of full memory. `needs`: damping (N·s/m) it requires,
+    computed by the device.
+    """
+
+    set_id: int
     K0: float
     K1: float
     B1: float
@@ -43,69 +88,8 @@ class ParameterSet:
     memory: str
     length: int
     force_limit: float
-
-    def messages(self, set_id: int, tick_rate: int) -> list[SetParams | SetStates]:
-        """SET_PARAMS message, followed for full memory by SET_STATES; `tick_rate` in Hz.
-
-        Raises `InputError` for invalid numbers.
-        """
-        if self.memory not in ("short", "full"):
-            raise InputError(f'memory is "{self.memory}"; it must be "short" or "full".')
-        for name in ("K0", "K1", "B1", "alpha", "force_limit"):
-            value = getattr(self, name)
-            if not math.isfinite(value) or abs(value) > 3e38:
-                raise InputError(f"{name} is {value}; it must be a finite number.")
-        if not 0 <= self.length < 2**16:
-            raise InputError(f"N (or states) is {self.length}; it must be a number of samples (or exponentials).")
-        numbers = {wire: getattr(self, name) for name, wire in _WIRE_NAMES.items()}
-        head = SetParams(set_id=set_id, memory=int(self.memory == "full"), tick_rate_Hz=tick_rate, **numbers)
-        return [head, *(_states(set_id, self.alpha, self.length) if self.memory == "full" else [])]
-
-
-@dataclass(frozen=True)
-class InForce(ParameterSet):
-    """Parameter set in force on a device, rounded to binary32.
-
-    `needs`: damping (N·s/m) it requires, computed by the device.
-    """
-
-    set_id: int
     needs: float
     crc: int
-
-    def _asdict(self) -> dict[str, Any]:
-        """Flat dict for logs and `--json`, with the id first."""
-        return {"set_id": self.set_id} | asdict(self)
-
-
-def wanted_for(
-    device: HelloReply,
-    *,
-    K0: SupportsFloat,
-    K1: SupportsFloat,
-    B1: SupportsFloat,
-    alpha: SupportsFloat,
-    N: int = 101,
-    T: SupportsFloat = 1e-3,
-    memory: str = "short",
-    states: int = 10,
-    force_limit: SupportsFloat | None = None,
-) -> ParameterSet:
-    """Parameter set for a device, with its own force limit as the default.
-
-    Raises `InputError` for one that cannot be sent.
-
-    Units as in `ParameterSet`, T in s. Full memory imports JAX here already, so that sending the set later is fast.
-    """
-    rate = device.tick_rate_Hz
-    if not abs(rate * _number("T", T) - 1) < 1e-9:
-        raise InputError(f"T is {T} s and the device's tick {1 / rate!r} s; a set belongs to its T, choose another.")
-    limit = device.force_limit_N if force_limit is None else _number("force_limit", force_limit)
-    length = states if memory == "full" else N
-    numbers = {name: _number(name, value) for name, value in (("K0", K0), ("K1", K1), ("B1", B1), ("alpha", alpha))}
-    wanted = ParameterSet(**numbers, memory=memory, length=length, force_limit=limit)
-    wanted.messages(1, rate)
-    return wanted
 
 
 def _number(name: str, value: SupportsFloat) -> float:
@@ -144,8 +128,8 @@ def _bits(value: float | int) -> bytes | int:
     return struct.pack("<f", value) if isinstance(value, float) else value
 
 
-def _states(set_id: int, alpha: float, count: int) -> list[SetStates]:
-    """SET_STATES messages with the exponentials of full memory. Raises `InputError` for an invalid count or alpha."""
+def _states(alpha: float, count: int) -> list[SetStates]:
+    """The exponentials of full memory, as many to a message as fit."""
     if count not in STATES:
         raise InputError(f"states is {count}; it must be one of {', '.join(map(str, STATES))}.")
     if not 0 < alpha < 1:
@@ -158,4 +142,4 @@ def _states(set_id: int, alpha: float, count: int) -> list[SetStates]:
     weight, loss = (np.asarray(values, float) for values in exponentials(jnp.asarray(alpha, float), count))
     pairs = tuple(Exponential(*map(float, pair)) for pair in zip(weight, loss, strict=True))
     chunks = [(first, pairs[first : first + _PER_MESSAGE]) for first in range(0, count, _PER_MESSAGE)]
-    return [SetStates(set_id=set_id, first=first, count=len(chunk), states=chunk) for first, chunk in chunks]
+    return [SetStates(set_id=0, first=first, count=len(chunk), states=chunk) for first, chunk in chunks]

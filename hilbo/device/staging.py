@@ -1,12 +1,13 @@
 """Transfer of a parameter set to a device: send, check the CRC, commit when the device allows it, and read back."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from hilbo.device import protocol
 from hilbo.device.failures import DeviceError
 from hilbo.device.link import Link
 from hilbo.device.messages import Ack, HelloReply, Message, SetParams, SetStates, Status
-from hilbo.device.parameter_sets import InForce, ParameterSet, crc_of, differences, in_force
+from hilbo.device.parameter_sets import InForce, crc_of, differences, in_force
 from hilbo.device.reasons import NackReason
 
 __all__ = ["put_in_force", "retry_while_busy"]
@@ -15,16 +16,17 @@ _LATER = (NackReason.NOT_READY, NackReason.BUSY)
 _LONGEST_PAUSE = 0.1  # s between two tries
 
 
-def put_in_force(link: Link, device: HelloReply, wanted: ParameterSet, wait: float) -> InForce:
+def put_in_force(link: Link, device: HelloReply, wanted: Sequence[SetParams | SetStates], wait: float) -> InForce:
     """Put the set `wanted` in force and return it as the device reports it, checked bit for bit.
 
-    A set that is already in force is not sent again. `wait` (s): timeout for the device to fill the set's history.
+    `wanted`: messages of a `ParameterSet`, numbered here. A set that is already in force is not sent again. `wait` (s):
+    timeout for the device to fill the set's history.
     """
     status: Status = link.request(protocol.GetStatus())
-    messages = wanted.messages(status.active_id, device.tick_rate_Hz)
+    messages = [replace(message, set_id=status.active_id) for message in wanted]
     if status.active_id == 0 or crc_of(messages) != status.active_crc:
         set_id = max(status.active_id, status.staged_id) % 0xFFFF + 1
-        messages = wanted.messages(set_id, device.tick_rate_Hz)
+        messages = [replace(message, set_id=set_id) for message in wanted]
         give_up = link.now() + wait
         _stage(link, device, messages, give_up)
         commit = protocol.Commit(set_id=set_id, crc=crc_of(messages), boot_id=device.boot_id)

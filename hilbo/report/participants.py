@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from hilbo.numerics.tracing import program
 from hilbo.report.json_text import quoted
+from hilbo.search.rendering import derived_of
 from hilbo.study.config import Study
 
 __all__ = ["People", "as_json", "json_lines", "parameter_sets", "people_of"]
@@ -94,8 +95,7 @@ def parameter_sets(study: Study, x: Float[np.ndarray, "M d"]) -> tuple[dict[str,
 @program
 def _mechanics(space, x):
     physical = space.to_physical(x)
-    values = {name: physical[:, i] for i, name in enumerate(space.names)}
-    return physical, space.derived(values), space.passivity_margin(values)
+    return physical, *derived_of(space, physical)
 
 
 def as_json(content: dict[str, Any]) -> str:

@@ -22,7 +22,7 @@ from hilbo.report.figures.painter import write_figures
 from hilbo.report.page import Pictures, results_page
 from hilbo.report.participants import People, as_json, json_lines, people_of
 from hilbo.search.apart import differences, nrmse
-from hilbo.search.rendering import K0_range, margin_of, set_of
+from hilbo.search.rendering import K0_range, Rendering
 from hilbo.study.analysis.cohort_results import CohortResults
 from hilbo.study.analysis.effects import effects_of
 from hilbo.study.analysis.heterogeneity import heterogeneity, in_place, rule_warnings
@@ -60,8 +60,8 @@ def misses(
     errors = np.asarray(nrmse(x, truth, study.gp.kernel.levels))
     if study.space.mechanics is None:
         return errors, None
-    K0 = np.array([set_of(study.space, row)["K0"] for row in x.reshape(-1, x.shape[-1])]).reshape(errors.shape)
-    K0_error = (K0 - set_of(study.space, truth)["K0"]) / K0_range(study.space)
+    *K0, true_K0 = (Rendering.at(study.space, row).parameters["K0"] for row in (*x.reshape(-1, x.shape[-1]), truth))
+    K0_error = (np.array(K0).reshape(errors.shape) - true_K0) / K0_range(study.space)
     d = x.shape[-1]
     return errors, np.asarray(np.sqrt((d * errors**2 + K0_error**2) / (d + 1)))
 
@@ -131,7 +131,8 @@ def _mean_of_optima(study: Study, mean: Float[Array, " d"] | None) -> dict[str, 
     """The mean of everybody's own optimum, which nobody was asked about; None where no optimum was sought."""
     if mean is None:
         return None
-    return {"parameters": set_of(study.space, mean), "passivity_margin": margin_of(study.space, mean)}
+    rendering = Rendering.at(study.space, mean)
+    return {"parameters": rendering.shown, "passivity_margin": rendering.margin}
 
 
 def _location(study: Study, aggregate: Aggregate | LargeAggregate, name: str, optimum: Optimum) -> list[str]:
@@ -144,7 +145,7 @@ def _location(study: Study, aggregate: Aggregate | LargeAggregate, name: str, op
 def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> dict[str, Any]:
     """How far one optimum is from another: NRMSE, and each parameter's way in its unit and in % of its range; from one
     level to another it is 100 %, and the way in words."""
-    target, origin = set_of(study.space, x), set_of(study.space, start)
+    target, origin = (Rendering.at(study.space, point).shown for point in (x, start))
     levels = study.gp.kernel.levels
     percent = 100 * differences(levels, np.asarray(x), np.asarray(start))
     share = dict(zip(study.space.names, percent.tolist(), strict=True))
@@ -176,14 +177,14 @@ def _not_converged(people: People) -> list[str]:
 
 def optimum_content(study: Study, optimum: Optimum) -> dict[str, Any]:
     """An optimum as result.json holds it."""
-    labels = study.responses
+    labels, rendering = study.responses, Rendering.at(study.space, optimum.x)
     return {
-        "parameters": set_of(study.space, optimum.x),
+        "parameters": rendering.shown,
         "unit": np.asarray(optimum.x).tolist(),
         "mean": float(optimum.mean),
         "sd": float(optimum.sd),
         "class_probabilities": dict(zip(labels, np.asarray(optimum.class_probabilities).tolist(), strict=True)),
-        "passivity_margin": margin_of(study.space, optimum.x),
+        "passivity_margin": rendering.margin,
     }
 
 
@@ -206,7 +207,7 @@ def _truth(study, aggregate, truth):
     trials = aggregate.cohort.trials
     top = ((np.asarray(trials.q) == len(study.responses) - 1) & np.asarray(trials.mask)).sum(axis=1)
     return {
-        "parameters": set_of(study.space, truth),
+        "parameters": Rendering.at(study.space, truth).shown,
         "nrmse": table,
         "individuals": individuals,
         "top_answers": {"mean": float(top.mean()), "sd": float(top.std(ddof=1)) if len(top) > 1 else None},

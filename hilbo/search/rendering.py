@@ -1,28 +1,92 @@
-"""A point of the unit cube as what is rendered: its parameter set with the derived K0, and its passivity margin."""
+"""A rendering: values of a search space's parameters, and what the mechanics of the space derive from them."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
+from hilbo.numerics.tracing import OfArrays, prepared
 from hilbo.search.space import SearchSpace
 
-__all__ = ["K0_range", "delay_words", "margin_of", "set_of"]
+__all__ = ["K0_range", "Rendering", "delay_words", "derived_of"]
 
 
-def set_of(space: SearchSpace, x: ArrayLike) -> dict[str, Any]:
-    """A point of the unit cube as a parameter set in physical units, derived K0 included."""
-    physical = np.asarray(space.to_physical(np.asarray(x)))
-    values = dict(zip(space.names, physical.tolist(), strict=True))
-    shown = {p.name: p.shown(values[p.name]) for p in space.parameters}
-    return {name: float(value) for name, value in space.derived(values).items()} | shown
+@dataclass(frozen=True)
+class Rendering:
+    """A point of a search space in physical units; made by `of` and `at`.
+
+    `values`: parameter -> number in its unit, of a level its place in the list, in the order of the space. K0 and the
+    passivity margin are computed once, when either is read.
+    """
+
+    space: SearchSpace = field(repr=False)
+    values: dict[str, float]
+
+    @classmethod
+    def of(cls, space: SearchSpace, physical: Mapping[str, float] | Float[Any, " d"]) -> "Rendering":
+        """From physical values: by name, of which those that are no parameters are left out, or (d,) in the order of
+        the space."""
+        if not isinstance(physical, Mapping):
+            physical = dict(zip(space.names, np.asarray(physical).tolist(), strict=True))
+        return cls(space, {name: float(physical[name]) for name in space.names})
+
+    @classmethod
+    def at(cls, space: SearchSpace, x: ArrayLike) -> "Rendering":
+        """From a point (d,) of the unit cube."""
+        return cls.of(space, space.to_physical(np.asarray(x)))
+
+    @property
+    def point(self) -> Float[np.ndarray, " d"]:
+        """The values (d,) in the order of the space."""
+        return np.array(list(self.values.values()))
+
+    @cached_property
+    def _derived(self) -> tuple[dict[str, float], float | None]:
+        if self.space.mechanics is None:
+            return {}, None
+        K0, margin = np.asarray(_program(self.space)((self.point,))).tolist()
+        return {"K0": K0}, margin
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The values, and K0 (N/mm) where the space has mechanics: what logs hold and devices render."""
+        return self.values | self._derived[0]
+
+    @property
+    def shown(self) -> dict[str, Any]:
+        """K0 and the values as tables hold them: levels by their names, whole numbers as such."""
+        return self._derived[0] | {p.name: p.shown(self.values[p.name]) for p in self.space.parameters}
+
+    @property
+    def margin(self) -> float | None:
+        """Passivity margin, N·s/m; negative where the rendering is not passive. None without mechanics."""
+        return self._derived[1]
 
 
-def margin_of(space: SearchSpace, x: ArrayLike) -> float | None:
-    """Passivity margin (N.s/m) of a point, None without mechanics; negative means not passive."""
-    values = set_of(space, x)
-    margin = space.passivity_margin({name: values[name] for name in space.names})
-    return None if margin is None else float(margin)
+def derived_of(
+    space: SearchSpace, physical: Float[Array, "*batch d"]
+) -> tuple[dict[str, Float[Array, "*batch"]], Float[Array, "*batch"] | None]:
+    """K0 (N/mm) by name and the passivity margin (N·s/m) of physical values, last axis = parameter; {} and None without
+    mechanics. Traceable."""
+    values = {name: physical[..., i] for i, name in enumerate(space.names)}
+    return space.derived(values), space.passivity_margin(values)
+
+
+def _K0_and_margin(space: SearchSpace, physical: Float[Array, " d"]) -> Float[Array, "2"]:
+    derived, margin = derived_of(space, physical)
+    assert margin is not None  # only asked for with mechanics
+    return jnp.stack([derived["K0"], margin])
+
+
+@lru_cache(maxsize=16)
+def _program(space: SearchSpace) -> OfArrays:
+    """`_K0_and_margin` of a space, compiled; as a function of the point alone, since a live session waits for it."""
+    return prepared(_K0_and_margin, space, np.zeros(space.dim))
 
 
 def delay_words(space: SearchSpace) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hilbo.errors import InputError
+from hilbo.search.rendering import Rendering
 from hilbo.simulation.simulate import Population
 from hilbo.study.config import Study
 from hilbo.study.file.simulated_people import SimulationTable, each
@@ -96,4 +97,4 @@ def with_truth(study: Study, population: Population, seed: int) -> Population:
         return population
     points = np.asarray(study.space.to_physical(study.space.candidates(256, 0)))
     drawn = points[np.random.default_rng([seed, 17]).integers(len(points))]
-    return dataclasses.replace(population, truth=dict(zip(study.space.names, drawn.tolist(), strict=True)))
+    return dataclasses.replace(population, truth=Rendering.of(study.space, drawn).values)

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from hilbo.search.rendering import set_of
+from hilbo.search.rendering import Rendering
 from hilbo.session.plan.set_codes import OWN, code_of
 from hilbo.simulation.simulate import Person, Population, felt_apart, people
 from hilbo.study.analysis.tolerance import Sets
@@ -31,12 +31,12 @@ def sets_table(study: Study, sets: Sets, individuals: Float[np.ndarray, "M d"]) 
     `individuals` (M, d) in the unit cube.
     """
     rows = [
-        {"set_id": role, "source": "aggregate", "role": role} | set_of(study.space, x)
+        {"set_id": role, "source": "aggregate", "role": role} | Rendering.at(study.space, x).shown
         for role, x in zip(("best", "mid", "worst"), np.asarray(sets.x), strict=True)
     ]
     own: dict[str, dict[str, float]] = {}
     for x in individuals:
-        values = set_of(study.space, x)
+        values = Rendering.at(study.space, x).shown
         own[code_of(sorted(values.items()), own)] = values
     rows += [{"set_id": f"own-{code}", "source": OWN + code, "role": ""} | own[code] for code in sorted(own)]
     table = pd.DataFrame(rows)

@@ -16,7 +16,7 @@ import pytest
 from killed_session import Session
 
 from hilbo.app.rehearsal.robot import Client
-from hilbo.session.choose.look_ahead import Answers
+from hilbo.session.choose.choice import Answers
 from hilbo.session.log.event_log import read_log
 from hilbo.session.log.state import LiveSession
 from hilbo.study.config import Study

@@ -11,7 +11,7 @@ from studies import plain_study
 from hilbo.report.page import _environment, rendered
 from hilbo.report.robustness import robustness_page
 from hilbo.report.study import report as study_report
-from hilbo.search.rendering import set_of
+from hilbo.search.rendering import Rendering
 from hilbo.study.folder import StudyFolder
 
 VERSIONS = {"hilbo": "1", "python": "3.11"}
@@ -91,7 +91,7 @@ def test_it_says_why_rules_were_not_compared():
 def robust(shared, nrmse, resampled=MappingProxyType({"median": 0.02, "95 %": 0.025})):
     """The page of a robustness check of two people, the second of whom moved."""
     study = plain_study(2)
-    optimum = {"parameters": set_of(study.space, np.full(2, 0.5)), "mean": 1.0, "sd": 0.25}
+    optimum = {"parameters": Rendering.at(study.space, np.full(2, 0.5)).shown, "mean": 1.0, "sd": 0.25}
     still = {"participant": "A", "nrmse": 0.01, "flagged": False, "converged": True, "runaway": False}
     learned = {"parameters": ["theta", "noise"], "shared": shared, "theta": [5.0, 1 / 3], "variance": 1.0}
     learned |= {"noise": 0.5, "thresholds": [0.0]}

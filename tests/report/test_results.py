@@ -15,7 +15,7 @@ from hilbo.kernels import Matern32
 from hilbo.report import participants, results
 from hilbo.report.page import results_page
 from hilbo.search.box import Constraint
-from hilbo.search.rendering import K0_range, margin_of, set_of
+from hilbo.search.rendering import K0_range, Rendering
 from hilbo.study.analysis.cohort_results import analyse_cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import aggregate_cohort
@@ -44,7 +44,7 @@ def test_misses_are_those_of_the_paper(values, three, with_K0):
 def test_errors_by_search_range_are_those_of_the_paper():
     for values, percent in ((AGGREGATE, (1.8, 0.4, 6.2, 2.8)), (MEAN_OF_OPTIMA, (13.1, 8.8, 13.7, 8.1))):
         off = unit(values) - unit(SYSTEM_IDENTIFICATION)
-        K0 = [set_of(PAPER.space, unit(v))["K0"] for v in (values, SYSTEM_IDENTIFICATION)]
+        K0 = [Rendering.at(PAPER.space, unit(v)).shown["K0"] for v in (values, SYSTEM_IDENTIFICATION)]
         percents = 100 * np.abs([(K0[0] - K0[1]) / K0_range(PAPER.space), *off])
         np.testing.assert_allclose(percents, percent, atol=0.06)
 
@@ -57,9 +57,9 @@ def test_misses_of_many_points_are_those_of_each():
 
 
 def test_a_parameter_set_has_its_k0_and_margin():
-    assert set_of(PAPER.space, unit(AGGREGATE))["K0"] == pytest.approx(-3.19, abs=0.01)
-    assert margin_of(PAPER.space, unit(AGGREGATE)) == pytest.approx(0.95 - 0.75981, abs=1e-5)
-    assert margin_of(PAPER.space, unit(MEAN_OF_OPTIMA)) == pytest.approx(0.95 - 1.34159, abs=1e-5)
+    assert Rendering.at(PAPER.space, unit(AGGREGATE)).shown["K0"] == pytest.approx(-3.19, abs=0.01)
+    assert Rendering.at(PAPER.space, unit(AGGREGATE)).margin == pytest.approx(0.95 - 0.75981, abs=1e-5)
+    assert Rendering.at(PAPER.space, unit(MEAN_OF_OPTIMA)).margin == pytest.approx(0.95 - 1.34159, abs=1e-5)
 
 
 def test_what_is_not_finite_is_null():
@@ -203,10 +203,10 @@ def test_many_participants_are_written_as_few():
     names, x = [f"P{i}" for i in range(5)], np.random.default_rng(0).uniform(size=(5, 3)) * [1, 1, 0.1]
     sets, margins = participants.parameter_sets(PAPER, x)
     for j in range(5):
-        one = set_of(PAPER.space, x[j])
+        one = Rendering.at(PAPER.space, x[j]).shown
         assert {name: values[j] for name, values in sets.items()} == pytest.approx(one, rel=1e-12)
         assert list(sets) == list(one)
-        assert margins[j] == pytest.approx(margin_of(PAPER.space, x[j]), rel=1e-12)
+        assert margins[j] == pytest.approx(Rendering.at(PAPER.space, x[j]).margin, rel=1e-12)
     optima = {"x": x, "mean": x[:, 0], "sd": x[:, 1], "class_probabilities": x}
     certificate = {"residual": np.array([1.0, np.nan, 0, 0, 0]), "converged": np.ones(5, bool)}
     people = participants.People(names, np.arange(5), certificate, PAPER.responses, optima, sets, margins)

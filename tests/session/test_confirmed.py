@@ -11,7 +11,7 @@ from live import CHOOSER, RAW, SETS, beginning, header
 
 from hilbo import Study
 from hilbo.errors import InputError
-from hilbo.session.choose.look_ahead import Answers
+from hilbo.session.choose.choice import Answers
 from hilbo.session.export.psych_ds import psych_ds
 from hilbo.session.export.tables import sets_table, trials_table, validation_table
 from hilbo.session.log import actions as live

@@ -12,10 +12,10 @@ from hilbo import Session, Study
 from hilbo.app.pages.pace import minutes_left
 from hilbo.errors import InputError
 from hilbo.search.candidates import search_points
-from hilbo.session.choose import explanation
-from hilbo.session.choose.avoided import APART, spread_point, when_nothing_is_apart
+from hilbo.session.choose import choice as choosing
+from hilbo.session.choose.choice import APART, Answers, all_excluded, spread_point, unanswered
 from hilbo.session.choose.logged_session import LoggedSession
-from hilbo.session.choose.look_ahead import Answers, LiveChooser, _missing
+from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.choose.progress import consistency, trust_of
 from hilbo.session.choose.warm_start import informed, warm_point, warm_start
 from hilbo.session.log import actions as live
@@ -157,9 +157,9 @@ def test_a_warm_start_chooses_from_the_map_and_is_in_the_header():
 
 def test_a_value_that_the_first_design_has_twice_is_asked_twice():
     design = np.array([[1.0], [0.0], [0.0], [1.0], [1.0]])
-    left = _missing(design, ((1.0,), (0.0,)), ())
+    left = unanswered(design, ((1.0,), (0.0,)), ())
     assert [row.tolist() for row in left] == [[0.0], [1.0], [1.0]]
-    assert [row.tolist() for row in _missing(design, ((0.0,),), ((1.0,),))] == [[0.0]]
+    assert [row.tolist() for row in unanswered(design, ((0.0,),), ((1.0,),))] == [[0.0]]
 
 
 def test_where_every_value_was_asked_the_one_asked_least_comes_and_no_excluded_one():
@@ -191,11 +191,11 @@ def test_where_every_rendering_stopped_twice_they_come_in_turn():
 def test_of_many_steps_one_that_never_stopped_comes_first():
     raw = RAW | {"parameters": {"n": {"low": 0.0, "high": 40.0, "integer": True}}}
     stopped = np.arange(0.0, 41.0, 2.0)[:, None]
-    (left,) = when_nothing_is_apart(Study.from_dict(raw), stopped)
+    (left,) = all_excluded(Study.from_dict(raw), stopped)
     assert left % 2 == 1
     everything = np.arange(41.0)[::-1, None]
-    assert when_nothing_is_apart(Study.from_dict(raw), everything).tolist() == [40.0]
-    assert when_nothing_is_apart(Study.from_dict(raw), stopped[:3]) is None
+    assert all_excluded(Study.from_dict(raw), everything).tolist() == [40.0]
+    assert all_excluded(Study.from_dict(raw), stopped[:3]) is None
 
 
 def test_a_warm_start_keeps_apart_from_one_level_and_not_from_its_neighbour():
@@ -377,12 +377,12 @@ def test_a_space_filling_point_that_is_not_shown_again_is_replaced_once(chooser)
 
 def test_numbers_that_are_none_stay_out_of_a_choice_and_of_the_log(monkeypatch, tmp_path):
     def broken(study, posterior, point):
-        explained, nan = real(study, posterior, point), jnp.asarray(np.nan)
-        figures = dataclasses.replace(explained.certificate, residual=nan, condition=jnp.asarray(np.inf))
-        return explained._replace(mean=nan, variance=jnp.asarray(-1e-18), certificate=figures)
+        predicted, nan = real(study, posterior, point), jnp.asarray(np.nan)
+        figures = dataclasses.replace(predicted.certificate, residual=nan, condition=jnp.asarray(np.inf))
+        return predicted._replace(mean=nan, variance=jnp.asarray(-1e-18), certificate=figures)
 
-    real = explanation._explanation
-    monkeypatch.setattr(explanation, "_explanation", broken)
+    real = choosing._prediction
+    monkeypatch.setattr(choosing, "_prediction", broken)
     event = live.propose(start(), LiveChooser(start()), 0.0)
     choice = event.data["choice"]
     assert not {"mean", "sd"} & set(choice)

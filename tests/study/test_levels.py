@@ -17,7 +17,7 @@ from hilbo.errors import InputError
 from hilbo.kernels import RBF, Matern32, embedded, gram, theta_of
 from hilbo.population.rules.registry import RECIPES
 from hilbo.search.apart import differences, middle_of, nrmse
-from hilbo.search.rendering import set_of
+from hilbo.search.rendering import Rendering
 from hilbo.simulation.presets import population_of
 from hilbo.simulation.simulate import people
 from hilbo.study.analysis.hills import hills_of
@@ -130,7 +130,7 @@ def test_levels_in_another_order_give_the_same_map_and_optimum(order):
     table, results = answers(), []
     for study in (surfaces(), surfaces(order)):
         aggregate = aggregate_cohort(study, cohort_of(table, study), alternatives=False)
-        best = set_of(study.space, aggregate.optimum.x)
+        best = Rendering.at(study.space, aggregate.optimum.x).shown
         results.append(
             (best.pop("texture"), list(best.values()), [np.asarray(m) for m in aggregate.surface(asked(study))])
         )

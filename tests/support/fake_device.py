@@ -3,7 +3,7 @@
 Every order is carried out by the rules of firmware/PROTOCOL.md that a session depends on, without a line in between.
 """
 
-from dataclasses import fields
+from dataclasses import asdict, fields
 from types import SimpleNamespace
 
 import numpy as np
@@ -44,9 +44,9 @@ class FakeDevice(Renderer):
         seen |= {"stops": self.link.stops, "position_mm": float(self.pressed), "force_N": 0.0, "energy_mJ": 0.0}
         return Status(**seen)
 
-    def send(self, **numbers):
+    def send(self, wanted):
         self.told.append("send")
-        return SimpleNamespace(_asdict=lambda: numbers)
+        return SimpleNamespace(_asdict=lambda: asdict(wanted))
 
     def start(self, *, stop=None, wait=0.0):
         self.starts, self._samples = self.starts + 1, []

@@ -16,8 +16,10 @@ from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.search.apart import differences
 from hilbo.search.box import Parameter
+from hilbo.search.rendering import Rendering
 from hilbo.session.choose import progress
-from hilbo.session.choose.look_ahead import Answers, LiveChooser
+from hilbo.session.choose.choice import Answers
+from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.log.state import LiveSession
 from hilbo.study.config import Study
 
@@ -40,7 +42,7 @@ class Maps:
             fitted, study = self._chooser.fitted(Answers(block)), self._chooser.study(block)
             self._sliced(Answers(block), None)
             following = [fitted] * len(study.responses)
-            progress.trust(study, fitted, fitted.point, following, lambda one, of=block: self._chooser.best(of, one))
+            progress.trust(self._chooser, block, fitted, fitted.point, following)
 
     def trust(self, state: LiveSession) -> list[list[str]]:
         """How far the session has come, in words: name and value."""
@@ -90,7 +92,7 @@ class Maps:
         maps: _Slices = jax.device_get(_slices(study, fitted.posterior, best))
         marks = np.asarray(fitted.posterior.trials.x)[: len(answers.categories)]
         levels = np.array(answers.categories, int) / (len(study.responses) - 1)
-        felt = None if asked is None else np.asarray(study.space.to_unit(np.array([asked[name] for name in names])))
+        felt = None if asked is None else np.asarray(study.space.to_unit(Rendering.of(study.space, asked).point))
         pairs = enumerate(_pairs(len(names)))
         return [_slice(study, maps, k, pair, marks, levels, felt) for k, pair in pairs]
 

@@ -25,6 +25,7 @@ from hilbo.app.rehearsal.robot import SIZES, Participant, browser, held, screens
 from hilbo.app.rehearsal.stand_in import StandIn
 from hilbo.device.local.simulator import Simulator
 from hilbo.search.apart import levels_of, nrmse
+from hilbo.search.rendering import Rendering
 from hilbo.session.log.event_log import read_log
 from hilbo.session.plan.plan import make_plan
 from hilbo.simulation import simulate
@@ -98,9 +99,7 @@ def example_sets(study: Study, population: Population) -> dict[str, dict[str, fl
     centre = np.asarray(space.to_unit(np.array([truth[name] for name in space.names])))
     order = np.argsort(nrmse(points, centre, levels_of(space.parameters)))
     chosen = {"best": points[order[0]], "mid": points[order[len(order) // 3]], "worst": points[order[-1]]}
-    return {
-        n: dict(zip(space.names, np.asarray(space.to_physical(x)).tolist(), strict=True)) for n, x in chosen.items()
-    }
+    return {name: Rendering.at(space, x).values for name, x in chosen.items()}
 
 
 @contextlib.contextmanager

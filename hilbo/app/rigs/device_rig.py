@@ -21,8 +21,7 @@ from hilbo.app.rigs.rig import Loaded, Showing, Snapshot
 from hilbo.app.rigs.sample_flags import SampleCounter
 from hilbo.device.messages import Status
 from hilbo.device.reasons import DeviceFlag, HoldReason, held_because
-from hilbo.hardware_bridge import Capability, DeviceError, Renderer, State
-from hilbo.search.box import Mechanics
+from hilbo.hardware_bridge import Capability, DeviceError, ParameterSet, Renderer, State
 from hilbo.session.log.header_check import study_of
 from hilbo.study.file.reading import AnyStudy
 
@@ -48,7 +47,6 @@ class DeviceRig:
         notice: Callable[[str], Any] = lambda _: None,
     ):
         self._study, self._connect, self._changed, self._notice = study, connect, changed, notice
-        self._mechanics: dict[str | None, Mechanics | None] = {}
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future] | None] = queue.SimpleQueue()
         self._ending = threading.Event()
         self._own_stops, self._stopping = 0, 0  # STOPs of this rig that were acknowledged; 1 while one is on its way
@@ -136,14 +134,12 @@ class DeviceRig:
         with contextlib.suppress(DeviceError):
             self.device.close()
 
-    def _wanted(self, showing: Showing) -> dict[str, Any]:
-        """What `Renderer.send` takes."""
-        if showing.material not in self._mechanics:
-            self._mechanics[showing.material] = study_of(self._study, showing.material).space.mechanics
-        m, values = self._mechanics[showing.material], showing.values
+    def _wanted(self, showing: Showing) -> ParameterSet:
+        """The set of a rendering, with the memory and the period of its material's renderer."""
+        m, values = study_of(self._study, showing.material).space.mechanics, showing.values
         assert m is not None and values is not None  # a device renders, and a rendering
-        numbers = {name: values[name] for name in ("K0", "K1", "B1", "alpha")}
-        return numbers | {"N": m.N, "T": m.T, "memory": m.memory, "states": m.states}
+        numbers = (values[name] for name in ("K0", "K1", "B1", "alpha"))
+        return ParameterSet(*numbers, N=m.N, T=m.T, memory=m.memory, states=m.states)
 
     def _ready(self) -> Renderer:
         if self.snapshot.lost:
@@ -168,13 +164,13 @@ class DeviceRig:
             return False
         return True
 
-    def _load(self, device: Renderer, wanted: dict[str, Any]) -> Loaded | None:
+    def _load(self, device: Renderer, wanted: ParameterSet) -> Loaded | None:
         """The set in force; None while something touches the handle."""
         self._see(self._look())
         if self.snapshot.contact:
             return None
         begun = time.perf_counter()
-        in_force = device.send(**wanted)
+        in_force = device.send(wanted)
         took = time.perf_counter() - begun
         return Loaded({"in_force": in_force._asdict(), "serial_s": took}, took)
 

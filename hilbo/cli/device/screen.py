@@ -22,7 +22,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from hilbo.device.parameter_sets import InForce, wanted_for
+from hilbo.device.parameter_sets import InForce, ParameterSet
 from hilbo.device.reasons import DeviceFlag, SampleFlag, held_because, meaning
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, Renderer, State
@@ -131,7 +131,7 @@ def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float
     if not sets or len(sets) > len(_KEYS):
         raise InputError(f"There are {len(sets)} sets; between 1 and {len(_KEYS)} can be felt, one on each key.")
     for values in sets.values():
-        wanted_for(device.device, **values)  # says now what is wrong, and loads what full memory needs
+        ParameterSet(**values).messages(device.device)  # says now what is wrong, and loads what full memory needs
     names = list(sets)
     title = "  ".join(f"[{key}] {name}" for key, name in zip(_KEYS, names, strict=False))
     view = _View(device, f"{title}\nspace: start or stop   e: emergency stop   c: clear   q: end")

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from hilbo.report.results import moved
-from hilbo.search.rendering import margin_of, set_of
+from hilbo.search.rendering import Rendering
 from hilbo.study.analysis.analysis import Analysis
 
 __all__ = ["alternatives_table", "convergence_table", "table_1", "tolerance_table"]
@@ -21,15 +21,15 @@ def table_1(analysis: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
     """
     study, aggregate = analysis.study, analysis.aggregate
     mean, best = aggregate.mean_of_optima, aggregate.optimum.x
-    individual_sets = pd.DataFrame([set_of(study.space, x) for x in np.asarray(aggregate.individuals.x)])
-    ours, theirs = set_of(study.space, best), set_of(study.space, mean)
+    individual_sets = pd.DataFrame([Rendering.at(study.space, x).shown for x in np.asarray(aggregate.individuals.x)])
+    ours, theirs = (Rendering.at(study.space, x).shown for x in (best, mean))
     table = pd.DataFrame(
         {"parameter": list(ours), "aggregate": list(ours.values()), "mean_of_optima": list(theirs.values())}
     )
     spread = individual_sets.std(ddof=1, numeric_only=True)  # NaN of one; levels have none
     table["sd_of_optima"] = [spread.get(name, np.nan) for name in ours]
     if reference is not None:
-        table.insert(1, "reference", list(set_of(study.space, reference).values()))
+        table.insert(1, "reference", list(Rendering.at(study.space, reference).shown.values()))
         for name, x in (("error_percent", best), ("mean_error_percent", mean)):
             ways = moved(study, x, jnp.asarray(reference))["moved"]
             table[name] = [abs(ways[parameter]["percent"]) for parameter in ours]
@@ -96,11 +96,12 @@ def alternatives_table(analysis: Analysis) -> pd.DataFrame:
         claims |= {name: (analysis.sets.x[i], None) for i, name in enumerate(("best", "mid", "worst"))}
     rows = []
     for name, (x, optimum) in claims.items():
-        row = {"optimum": name} | set_of(study.space, x)
+        rendering = Rendering.at(study.space, x)
+        row = {"optimum": name} | rendering.shown
         row |= (
             {}
             if optimum is None
             else {"mean": float(optimum.mean), "sd": float(optimum.sd), "p_top": float(optimum.class_probabilities[-1])}
         )
-        rows.append(row if study.space.mechanics is None else row | {"passivity_margin": margin_of(study.space, x)})
+        rows.append(row if study.space.mechanics is None else row | {"passivity_margin": rendering.margin})
     return pd.DataFrame(rows)

@@ -10,7 +10,7 @@
 stays the default.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,10 +18,11 @@ from jaxtyping import Float
 
 from hilbo.numerics.tracing import program
 from hilbo.search.apart import nrmse
-from hilbo.session.choose.look_ahead import Answers, LiveChooser
+from hilbo.search.rendering import Rendering
+from hilbo.session.choose.choice import Answers
+from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.choose.step import Fitted
 from hilbo.session.log.state import LiveSession
-from hilbo.study.config import Study
 
 __all__ = ["Consistency", "Trust", "consistency", "trust", "trust_of"]
 
@@ -47,23 +48,23 @@ class Consistency:
 
 
 def trust(
-    study: Study,
+    chooser: LiveChooser,
+    block: int,
     fitted: Fitted,
     upcoming: Float[np.ndarray, " d"] | None,
     following: Sequence[Fitted],
-    best: Callable[[Fitted], Float[np.ndarray, " d"]],
 ) -> Trust:
-    """From the posterior after the answers so far, the rendering that comes next (physical units), and the posteriors
-    after each answer to it. `best` finds where a posterior's mean is largest. Nothing is fitted."""
-    bests = np.stack([best(one) for one in (fitted, *following)])
-    asked = bests[0] if upcoming is None else upcoming
-    top, chances = np.asarray(_chances(study, fitted.posterior, np.stack([bests[0], asked])))
-    named = dict(zip(study.space.names, bests[0].tolist(), strict=True))
-    if upcoming is None:
-        return Trust(named, float(top[-1]), None)
-    units = np.asarray(_units(study, bests))
-    moved = np.asarray(nrmse(units[1:], units[0], study.gp.kernel.levels))
-    return Trust(named, float(top[-1]), float(chances @ moved))
+    """From the posterior after the answers so far, the rendering (d,) that comes next in physical units, and the
+    posteriors after each answer to it. Nothing is fitted."""
+    study = chooser.study(block)
+    bests = np.stack([chooser.best(block, one) for one in (fitted, *following)])
+    next_one = bests[0] if upcoming is None else upcoming
+    top, chances = np.asarray(_chances(study, fitted.posterior, np.stack([bests[0], next_one])))
+    movement = None
+    if upcoming is not None:
+        units = np.asarray(_units(study, bests))
+        movement = float(chances @ np.asarray(nrmse(units[1:], units[0], study.gp.kernel.levels)))
+    return Trust(Rendering.of(study.space, bests[0]).values, float(top[-1]), movement)
 
 
 @program
@@ -77,17 +78,15 @@ def _units(study, physical):
 
 
 def trust_of(state: LiveSession, block: int, chooser: LiveChooser) -> Trust | None:
-    """`trust` in an optimisation block of a session, whose `chooser` knows the posteriors; None before its first
-    answer."""
-    answers, study = Answers.of(state, block), chooser.study(block)
+    """`trust` in an optimisation block of a session; None before its first answer."""
+    answers, trial = Answers.of(state, block), state.pending
     if not answers.categories:
         return None
-    trial = state.pending
-    # The answer to a repeat does not count, and moves nothing.
-    counts = trial is not None and trial.block == block and trial.repeats is None
-    upcoming = np.array([trial.presented["a"][name] for name in study.space.names]) if trial and counts else None
-    following = chooser.fitted_after_each_answer(state) if counts else []
-    return trust(study, chooser.fitted(answers), upcoming, following, lambda one: chooser.best(block, one))
+    fitted = chooser.fitted(answers)
+    if trial is None or trial.block != block or trial.repeats is not None:
+        return trust(chooser, block, fitted, None, [])  # the answer to a repeat does not count, and moves nothing
+    upcoming = Rendering.of(chooser.study(block).space, trial.presented["a"]).point
+    return trust(chooser, block, fitted, upcoming, [chooser.fitted(one) for one in Answers.after_pending(state)])
 
 
 def consistency(state: LiveSession) -> Consistency:

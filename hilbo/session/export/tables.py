@@ -158,10 +158,10 @@ def _parameters(box, values: Mapping[str, float]) -> dict[str, Any]:
     """A set's parameters, with the K0 of one that is rendered."""
     if box.mechanics is None:
         return {p.name: p.shown(values[p.name]) if p.levels else float(values[p.name]) for p in box.parameters}
-    from hilbo.search.set_facts import described
+    from hilbo.search.rendering import Rendering
     from hilbo.search.space import SearchSpace
 
-    return described(SearchSpace(box.parameters, box.mechanics), values).parameters
+    return Rendering.of(SearchSpace(box.parameters, box.mechanics), values).parameters
 
 
 def _rendered(mechanics) -> dict[str, Any]:

@@ -46,16 +46,16 @@ def material_seed(header: Header, material: str | None) -> int:
 
 def warm_up(study: AnyStudy, seed: int, material: str | None = None) -> tuple[Block, dict[str, dict[str, float]]]:
     """The warm-up: spread, feasible renderings from the seed, as many again for "another one"; and their sets."""
-    from hilbo.search.space import SearchSpace  # with JAX, which nothing else here needs
+    from hilbo.search.rendering import Rendering  # with JAX, which nothing else here needs
+    from hilbo.search.space import SearchSpace
 
     count = protocol(study.session, "warm-up").count
     box = study_of(study, material).space
     space = SearchSpace(box.parameters, box.mechanics, box.constraints)
     unit = np.concatenate([space.latin_hypercube(count, seed_of(seed, k)) for k in range(_SPARE)])
-    physical = np.asarray(space.to_physical(unit))
-    names = [f"warm-up {i + 1}" for i in range(len(physical))]
-    sets = {n: dict(zip(space.names, row, strict=True)) for n, row in zip(names, physical.tolist(), strict=True)}
-    return Block("warm-up", count, tuple(Planned(n) for n in names), material), sets
+    renderings = [Rendering.of(space, row) for row in np.asarray(space.to_physical(unit))]
+    sets = {f"warm-up {number}": rendering.values for number, rendering in enumerate(renderings, 1)}
+    return Block("warm-up", count, tuple(Planned(name) for name in sets), material), sets
 
 
 def header_for(

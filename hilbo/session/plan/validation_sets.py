@@ -9,11 +9,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hilbo.errors import InputError
 from hilbo.search.candidates import search_points
+from hilbo.search.rendering import Rendering
 from hilbo.session.plan.plan import Source
 from hilbo.study.analysis.tolerance import best_mid_worst
 from hilbo.study.cohort import Cohort
@@ -90,11 +90,8 @@ def aggregate_best_sets(study: Study, result: Result) -> NamedSets:
 
 
 def _named(study, unit, prefix) -> NamedSets:
-    physical = np.asarray(study.space.to_physical(jnp.asarray(unit))).tolist()
-    return {
-        prefix + name: dict(zip(study.space.names, row, strict=True))
-        for name, row in zip(_NAMES, physical, strict=True)
-    }
+    rows = np.asarray(study.space.to_physical(unit))
+    return {prefix + name: Rendering.of(study.space, row).values for name, row in zip(_NAMES, rows, strict=True)}
 
 
 def _check_same(study, result, x):

@@ -16,7 +16,7 @@ from hilbo.ordinal_gp import Trials
 from hilbo.population.learnt.rule import drawn_functions
 from hilbo.population.maps import RuleMap
 from hilbo.search.box import Parameter
-from hilbo.search.rendering import set_of
+from hilbo.search.rendering import Rendering
 from hilbo.study.analysis.hills import Hill, hills_of
 from hilbo.study.config import Study
 from hilbo.study.estimate.best_places import DRAWS, POINTS, best_places
@@ -94,8 +94,8 @@ def region_content(study: Study, region: Region | None) -> dict[str, Any] | None
         return None
     physical = np.asarray(study.space.to_physical(jnp.asarray(region.points)))
 
-    def of_box(x: Float[np.ndarray, " d"]) -> dict[str, float]:
-        return set_of(study.space, study.space.from_box(jnp.asarray(x)))
+    def of_box(x: Float[np.ndarray, " d"]) -> dict[str, Any]:
+        return Rendering.at(study.space, study.space.from_box(jnp.asarray(x))).shown
 
     return {
         "probability": PROBABILITY,
