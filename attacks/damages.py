@@ -42,10 +42,11 @@ from hilbo.session.log.event_log import EventLog, read_session
 from hilbo.session.plan.participants import add_person, read_people
 from hilbo.session.plan.plan import make_plan, plan_hash, planned_header, read_plan
 from hilbo.session.plan.validation_sets import aggregate_best_sets
+from hilbo.study.cohort import read_trials
 from hilbo.study.formats.json_file import sealed
 from hilbo.study.results.map_netcdf import write_map
 from hilbo.study.results.result_json import read_result
-from hilbo.study.tables.trials import read_trials, write_trials
+from hilbo.study.tables.trials import write_trials
 from hilbo.study.tables.validation import read_validation, sets_frame
 
 __all__ = ["damage_case"]
@@ -147,13 +148,13 @@ def _kinds(folder: Path) -> dict[str, Kind]:
 def _log(path: Path, kind: str) -> Path:
     driver = Driver(kind)
     driver.header = msgspec.structs.replace(driver.header, session=kind)
-    driver.state = type(driver.state).start(PLAIN, driver.header)
+    driver.state = type(driver.state).start(PLAIN.file, driver.header)
     driver.step()
     doings = ("feel", "answer", "answer", "go", "answer", "hold", "undo", "void", "again", "pause", "resume", "note")
     for number, doing in enumerate(doings * 2):
         driver.do(doing, number)
     driver.finish()
-    with EventLog.create(path, PLAIN, driver.header) as log:
+    with EventLog.create(path, PLAIN.file, driver.header) as log:
         for event in driver.events:
             log.append(event)
     return path
@@ -161,7 +162,7 @@ def _log(path: Path, kind: str) -> Path:
 
 def _read_log(path: Path) -> Any:
     """Header and events as plain data; after everything that is made of a log."""
-    state = read_session(path, PLAIN)
+    state = read_session(path, PLAIN.file)
     if state.trials:
         for table in (
             log_tables.trials_table,
@@ -214,7 +215,7 @@ def _check_log(content: Any) -> None:
         if event["kind"] == "propose":
             for values in event["data"]["renderings"].values():
                 _in_range({"": values}, PLAIN)
-    assert header["study"] == PLAIN.hash
+    assert header["study"] == PLAIN.file.hash
 
 
 def _in_range(sets: dict[str, dict[str, float]], study: Study) -> None:
@@ -235,7 +236,7 @@ def _result(path: Path, study: Study) -> Path:
         {"participant": name, "trials": 25, "optimum": optimum, "certificate": {"converged": True}}
         for name, optimum in zip(PEOPLE, optima[1:], strict=True)
     ]
-    content = {"optimum": optima[0], "participants": people, "study": study.hash, "seed": 0, "warnings": []}
+    content = {"optimum": optima[0], "participants": people, "study": study.file.hash, "seed": 0, "warnings": []}
     path.write_text("".join(sealed(json_lines(content))), encoding="utf-8")
     return path
 
@@ -310,7 +311,7 @@ def _forged_map(rng: random.Random, content: bytes) -> bytes:
 
 def _plan(path: Path) -> Path:
     sets = {"aggregate": {"u": 0.5, "v": 0.25}} | {f"individual:{p}": {"u": 0.1, "v": 0.2} for p in PEOPLE}
-    plan = make_plan(PLAIN, ["J01", "J02"], 3, "aggregate-best", sets={"": sets})
+    plan = make_plan(PLAIN.file, ["J01", "J02"], 3, "aggregate-best", sets={"": sets})
     path.write_text(json.dumps(plan, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return path
 
@@ -318,7 +319,7 @@ def _plan(path: Path) -> Path:
 def _read_plan(path: Path) -> Any:
     plan = read_plan(path)
     names = [row.get("participant") for row in plan.get("participants", []) if isinstance(row, dict)]
-    headers = [planned_header(plan, PLAIN, name) for name in names or ["J01"]]
+    headers = [planned_header(plan, PLAIN.file, name) for name in names or ["J01"]]
     for header in headers:
         _in_range(header.sets, PLAIN)
         for block in header.blocks:
@@ -335,7 +336,7 @@ def _forged_plan(rng: random.Random, content: bytes) -> bytes:
 
 def _tables(folder: Path) -> tuple[Path, Path, Path]:
     """The exported tables of the two logs."""
-    sessions = [read_session(path, PLAIN) for path in sorted(folder.glob("*.session.jsonl"))]
+    sessions = [read_session(path, PLAIN.file) for path in sorted(folder.glob("*.session.jsonl"))]
     made = (log_tables.trials_table(sessions), log_tables.validation_table(sessions), log_tables.sets_table(sessions))
     paths = tuple(folder / f"{name}.csv" for name in ("trials", "validation", "sets"))
     for table, path in zip(made, paths, strict=True):

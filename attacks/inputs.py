@@ -32,11 +32,10 @@ from attacks.support import HOSTILE, damaged, main, mutated, scratch
 from hilbo.errors import InputError
 from hilbo.session.plan.participants import read_people
 from hilbo.statistics.paper_tables import paper_tables
-from hilbo.study.cohort import cohort_of
+from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.config import Study
 from hilbo.study.folder import read_folder
 from hilbo.study.formats.cell_text import is_id, runs_in_a_spreadsheet
-from hilbo.study.tables.trials import read_trials
 from hilbo.study.tables.validation import read_validation, sets_frame
 
 __all__ = ["input_case"]
@@ -168,7 +167,7 @@ def _use(place: Path, path: Path) -> None:
     study = Study.load(place / "study.toml")
     match path.stem:
         case "study":
-            for name in study.materials or ("",):
+            for name in study.file.materials or ("",):
                 space = (study.material(name) if name else study).space
                 assert space.names
         case "trials":

@@ -86,8 +86,8 @@ class Kills:
         if self.session is not None and self.session.phase in ("done", "ended"):
             self.close()
             (log,) = (self.folder / f"session{self._begun}" / "logs").glob("*.jsonl")
-            header, events, _ = read_log(log, self.study)
-            assert LiveSession.fold(self.study, header, events).screen == "done"
+            header, events, _ = read_log(log, self.study.file)
+            assert LiveSession.fold(self.study.file, header, events).screen == "done"
         if self.session is None:
             self._begun += 1
             arguments = [str(self._file), "--participant", "P01", "--device", "sim"]

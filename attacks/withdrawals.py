@@ -108,7 +108,7 @@ def _resume_all() -> None:
 
     study = Study.load("study.toml")
     for path in sorted(Path().rglob("*.session.jsonl")):
-        EventLog.resume(path, study).close()
+        EventLog.resume(path, study.file).close()
 
 
 def _naming(root: Path, person: str) -> list[Path]:
@@ -207,8 +207,8 @@ def _logs(folder: Path) -> None:
 
     study, table = Study.load("study.toml"), pd.read_csv("trials.csv")
     for person, rows in table.groupby("participant"):
-        header, chooser = header_for(study, str(person), warm=False), _Given(rows, study.space.names)
-        with EventLog.create(folder / log_name(header), study, header) as log:
+        header, chooser = header_for(study.file, str(person), warm=False), _Given(rows, study.space.names)
+        with EventLog.create(folder / log_name(header), study.file, header) as log:
             for number, response in enumerate(rows["response"], 1):
                 log.append(actions.propose(log.state, chooser, float(number)))
                 given = {"class_a": response}
@@ -230,7 +230,7 @@ def _judged(folder: Path) -> None:
     _run("plan", "study.toml", "--names", names, *given)
     plan = json.loads(Path("plan-best.json").read_text())
     for name in names.split(","):
-        header = planned_header(plan, study, name)
+        header = planned_header(plan, study.file, name)
         assert log_name(header)
         with LoggedSession.open(folder, study, header) as session:
             while session.ask() is not None:

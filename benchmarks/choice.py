@@ -34,9 +34,9 @@ def states(study, count, seed=0):
         sessions.append(simulate.simulate_study(study, persons, seed + k))
     everybody = jax.tree.map(lambda *leaves: np.concatenate(leaves), *sessions)
     rng = np.random.default_rng(seed)
-    first = study.selection.space_filling
-    cases = rng.permutation(24 * studies * (study.selection.trials - first))[:count]
-    person, answers = np.divmod(cases, study.selection.trials - first)
+    first = study.file.selection.space_filling
+    cases = rng.permutation(24 * studies * (study.file.selection.trials - first))[:count]
+    person, answers = np.divmod(cases, study.file.selection.trials - first)
     chosen = jax.tree.map(lambda leaf: leaf[person], everybody)
     return jax.vmap(lambda t, n: t.first(n))(chosen, answers + first), answers + first
 
@@ -55,7 +55,7 @@ def compare(study, trials):
     space, plan = study.space, selection.design(study, 0)
     many = jnp.asarray(space.candidates(POINTS, 0))
     every = jnp.concatenate([many, jnp.asarray(space.walls(WALLS, 0))])
-    score = acquisition.UCB(study.selection.weight)
+    score = acquisition.UCB(study.file.selection.weight)
     box = {"from_box": space.from_box, "to_box": space.to_box, "feasible": space.feasible}
 
     @eqx.filter_jit
@@ -67,7 +67,7 @@ def compare(study, trials):
                 mean, variance = posterior.predict(x[None, :])
                 return score(mean[0], variance[0])
 
-            own = selection.point_after(study, plan, posterior, 0)
+            own = selection.point_after(selection.Choosing.of(study), plan, posterior, 0, study.file.selection.weight)
             values = score(*posterior.predict(every))
             inside = values[:POINTS]
             polished = acquisition.maximise(inside, many, at, **box, starts=1)

@@ -60,7 +60,7 @@ class Fitted(eqx.Module):
 
 def study_of(trials):
     """The paper's, with a smooth prior."""
-    raw = {"schema": 1} | json.loads(PAPER.content)
+    raw = {"schema": 1} | json.loads(PAPER.file.content)
     raw["gp"] |= {"theta": THETA, "variance": 1.0, "thresholds": [-0.5, 0.5], "noise": 0.5}
     raw["selection"] |= {"trials": trials}
     return Study.from_dict(raw)

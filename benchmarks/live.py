@@ -64,13 +64,13 @@ def one_session(file: Path, study: Study, folder: Path, number: int) -> tuple[li
 def choices(study: Study, seed: int) -> tuple[list[float], list[float]]:
     """Times (s) of proposals without looking ahead, and of `Session.tell`, for the same answers; compiled before."""
     chooser, bare = (
-        LiveChooser(LiveSession.start(study, header_for(study, "P", seed=seed, warm=False))),
+        LiveChooser(LiveSession.start(study.file, header_for(study.file, "P", seed=seed, warm=False))),
         Session.start(study, seed),
     )
     chooser.warm()
     bare.warm().join()
     state, decide = (
-        LiveSession.start(study, header_for(study, "P", seed=seed, warm=False)),
+        LiveSession.start(study.file, header_for(study.file, "P", seed=seed, warm=False)),
         Decider(study, preset_of("paper"), seed),
     )
     proposed, told = [], []
@@ -88,7 +88,7 @@ def choices(study: Study, seed: int) -> tuple[list[float], list[float]]:
         answered = answer(state, trial.id, "c", {"class_a": label}, 0.0)
         assert answered is not None
         state = state.after(answered)
-    fitted = study.selection.space_filling
+    fitted = study.file.selection.space_filling
     return proposed[fitted:], told[fitted - 1 : -1]
 
 

@@ -141,14 +141,14 @@ def by_recipe(study, cohort, recipe, candidates):
 
 
 def with_trials(study, trials):
-    raw = {"schema": 1} | json.loads(study.content)
+    raw = {"schema": 1} | json.loads(study.file.content)
     raw["selection"] |= {"space_filling": min(5, trials), "trials": trials}
     return Study.from_dict(raw)
 
 
 def without_gp(study):
     """Its sessions choose by the medians of the recipes' priors."""
-    raw = {"schema": 1} | json.loads(study.content)
+    raw = {"schema": 1} | json.loads(study.file.content)
     del raw["gp"]
     return Study.from_dict(raw | {"aggregation": {"rule": RECOMMENDED}})
 

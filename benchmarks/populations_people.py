@@ -126,7 +126,7 @@ class Functions(NamedTuple):
         """With the paper's fixed hyperparameters for the rules that take them as they are."""
         if self.dim is None and len(self.shares) == 3:
             return PAPER
-        raw = {"schema": 1} | json.loads(PAPER.content)
+        raw = {"schema": 1} | json.loads(PAPER.file.content)
         raw["study"] = {"name": "functions", "responses": [f"c{c}" for c in range(len(self.shares))]}
         raw["gp"] |= {"thresholds": np.linspace(-0.5, 0.5, len(self.shares) - 1).tolist()}
         if self.dim is not None:

@@ -74,7 +74,7 @@ def with_inference(study, inference):
 
 
 def edited(study, inference):
-    raw = json.loads(study.content) | {"schema": 1}
+    raw = json.loads(study.file.content) | {"schema": 1}
     raw["gp"]["inference"] = inference
     return raw
 

@@ -163,11 +163,10 @@ def sized(team, people):
 
     import numpy as np
 
-    from hilbo.study.cohort import cohort_of
+    from hilbo.study.cohort import cohort_of, read_trials
     from hilbo.study.config import Study
     from hilbo.study.estimate import batch
     from hilbo.study.estimate.batch_optimum import optima_from
-    from hilbo.study.tables.trials import read_trials
 
     study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
     points = study.space.candidates(POINTS, 0)

@@ -123,12 +123,12 @@ def one(name, seed, cut):
     crowd = value(np.asarray(space.to_physical(space.candidates(4096, 10**6))))
     edges = np.quantile(crowd, np.array(cut) / 100)
     chance = space.candidates(2048, 7 + seed)[np.random.default_rng(seed).permutation(2048)]
-    others = {"Sobol'": space.candidates(study.selection.trials, seed), "chance": chance}
+    others = {"Sobol'": space.candidates(study.file.selection.trials, seed), "chance": chance}
     curves, outside = {}, 0
     for way in WAYS:
         session, curve = Session.start(study, seed), {}
-        for trial in range(study.selection.trials):
-            if way == "hilbo" or trial < study.selection.space_filling:
+        for trial in range(study.file.selection.trials):
+            if way == "hilbo" or trial < study.file.selection.space_filling:
                 at = session.ask()
             else:
                 values = np.asarray(space.to_physical(others[way][trial])).tolist()

@@ -22,7 +22,7 @@ import numpy as np
 from hilbo import Study
 from hilbo.ordinal_gp import Trials, fit
 from hilbo.search.candidates import search_points
-from hilbo.session.choose.selection import design, point_after
+from hilbo.session.choose.selection import Choosing, design, point_after
 from hilbo.session.choose.warm_start import warm_point, warm_start
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import Person, people, simulate_study
@@ -38,7 +38,10 @@ def sessions(study: Study, persons: Person, initial, keys, plan, points, warm):
     def one(person, first, key):
         def step(trials, trial):
             before = fit(study.gp, trials, inference=study.inference, throw=False)
-            chosen = point_after(study, plan, before, trial) if warm is None else warm_point(study, warm, before)
+            if warm is None:
+                chosen = point_after(Choosing.of(study), plan, before, trial, study.file.selection.weight)
+            else:
+                chosen = warm_point(study, warm, before)
             count = first.shape[0]
             x = jnp.where(trial < count, first[jnp.minimum(trial, count - 1)], chosen) if count else chosen
             progress = (trial / TRIALS).astype(x.dtype)

@@ -35,8 +35,7 @@ from hilbo.inference.exact import exact  # noqa: E402
 from hilbo.kernels import gram  # noqa: E402
 from hilbo.likelihoods import TiltedTerms  # noqa: E402
 from hilbo.ordinal_gp import Posterior  # noqa: E402
-from hilbo.study.cohort import cohort_of  # noqa: E402
-from hilbo.study.tables.trials import read_trials  # noqa: E402
+from hilbo.study.cohort import cohort_of, read_trials  # noqa: E402
 
 __all__ = ["main"]
 

@@ -23,9 +23,8 @@ from hilbo.report.study.comparison import comparison_table
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import people, simulate_study, to_table
 from hilbo.study.analysis.rule_comparison import compare
-from hilbo.study.cohort import Cohort, cohort_of
+from hilbo.study.cohort import Cohort, cohort_of, read_trials
 from hilbo.study.estimate.aggregate import aggregate_cohort
-from hilbo.study.tables.trials import read_trials
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 

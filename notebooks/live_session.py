@@ -38,8 +38,8 @@ if "HILBO_NOTEBOOK_TRIALS" in os.environ:
 folder = Path(tempfile.mkdtemp())
 (folder / "study.toml").write_text(text + "\n[session.warm_up]\ncount = 2\n")
 study = Study.load(folder / "study.toml")
-header = header_for(study, "P01", seed=0)
-log = EventLog.create(folder / log_name(header), study, header)
+header = header_for(study.file, "P01", seed=0)
+log = EventLog.create(folder / log_name(header), study.file, header)
 chooser = LiveChooser(log.state)
 chooser.warm()
 decide = Decider(study, preset_of("paper"), seed=0)
@@ -82,6 +82,6 @@ print(participant_view(log.state)["message"])
 
 # %%
 log.close()
-with EventLog.resume(log.path, study) as again:
+with EventLog.resume(log.path, study.file) as again:
     print("the same state:", again.state == log.state, "in", again.state.seq, "events")
 print("looked up:", chooser.looked_up, "computed while somebody felt:", chooser.fits)

@@ -18,10 +18,9 @@ import numpy as np
 import hilbo
 from hilbo import Study
 from hilbo.report.figures.maps import map_slices
-from hilbo.study.cohort import cohort_of
+from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.estimate.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.estimate.optimum import population_optimum, predict_people
-from hilbo.study.tables.trials import read_trials
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 

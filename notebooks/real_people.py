@@ -22,9 +22,9 @@ from hilbo import Study
 from hilbo.population.judged.response_quality import excluded, measure_people
 from hilbo.report.figures.people import people_figure
 from hilbo.search.apart import nrmse
-from hilbo.study.cohort import cohort_of
+from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.estimate.aggregate import aggregate_cohort
-from hilbo.study.tables.trials import read_trials, write_trials
+from hilbo.study.tables.trials import write_trials
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 

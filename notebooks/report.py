@@ -24,10 +24,10 @@ from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import people, simulate_study, to_table, truth_table
 from hilbo.simulation.validation_sessions import sets_table, validation_table
 from hilbo.study.analysis.tolerance import best_mid_worst
-from hilbo.study.cohort import cohort_of
+from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.estimate.aggregate import aggregate_cohort
 from hilbo.study.folder import read_folder
-from hilbo.study.tables.trials import read_trials, write_trials
+from hilbo.study.tables.trials import write_trials
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from hilbo.errors import InputError
+from hilbo.study.cohort import read_trials
 from hilbo.study.config import Study
 from hilbo.study.file.reading import checked
-from hilbo.study.tables.trials import read_trials
 
 PAGE = Path(__file__).parents[1] / "guides" / "mistakes.md"
 STUDY = """\

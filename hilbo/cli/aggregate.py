@@ -78,7 +78,7 @@ def aggregate(
             left_out = [*flagged, *left_out]
             chosen = chosen if rule is None else by_rule(chosen, rule)
             cohort = cohort.first(first) if first else cohort
-            agree(digest(chosen.content, chosen.rule, seed, individuals, cohort))
+            agree(digest(chosen.file.content, chosen.rule, seed, individuals, cohort))
         if _at_once(chosen.rule, len(cohort.names), team.devices, individuals, compare):
             content = aggregate_cohort(chosen, cohort, folder, seed, say, compare=compare, left_out=left_out)
         else:
@@ -126,18 +126,18 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
     from hilbo.study.cohort import cohort_of
     from hilbo.study.config import Study
     from hilbo.study.tables.flag_counts import flag_sentences_of
-    from hilbo.study.tables.trials import read_trials
+    from hilbo.study.tables.trials import trial_table
 
     whole = Study.load(study)
-    material = material or _only_material(trials, whole)
-    chosen = whole.material(material) if material and whole.materials else whole
+    material = material or _only_material(trials, whole.file)
+    chosen = whole.material(material) if material and whole.file.materials else whole
     if trials.is_dir():
         from hilbo.session.export.tables import read_log_trials
 
-        table = read_log_trials(trials, whole, material, others=False, note=remark)
+        table = read_log_trials(trials, whole.file, material, others=False, note=remark)
     else:
-        table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
-    return chosen, cohort_of(table, chosen), flag_sentences_of(table, chosen.exclude_flags)
+        table = trial_table(trials, chosen.file, material, others=False, say=lambda rows: say("rows read", rows))
+    return chosen, cohort_of(table, chosen), flag_sentences_of(table, chosen.file.exclude_flags)
 
 
 def _only_material(trials: Path, study: Any) -> str | None:
@@ -164,7 +164,7 @@ def _chosen(cohort: Any, participants: str) -> Any:
 
 def _included(study, everybody) -> tuple[Any, list[str]]:
     """The cohort without those whom the study's rule leaves out, which is said; and the sentences."""
-    if not study.exclude:
+    if not study.file.exclude:
         return everybody, []
     from hilbo.study.exclusion import exclusion_sentences, included
 

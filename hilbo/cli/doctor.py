@@ -4,6 +4,7 @@ Nothing is changed: a file of a few bytes is written and removed where logs will
 stopped, never started.
 """
 
+import json
 import os
 import platform
 import shutil
@@ -175,7 +176,7 @@ def _study(path: Path) -> Iterator[Check]:
     except InputError as error:
         yield Check("feasible set", "bad", str(error), "fix the study file")
         return
-    if study.stimulus is None or study.space.constraints:
+    if study.file.stimulus is None or study.space.constraints:
         yield _feasible(study)
     yield _step(study)
 
@@ -198,7 +199,7 @@ def _feasible(study: Any) -> Check:
 
 def _step(study: Any) -> Check:
     """Time from an answer to the next point, compiled before but not chosen in advance."""
-    steps = min(study.selection.space_filling + 1, study.selection.trials - 1)
+    steps = min(study.file.selection.space_filling + 1, study.file.selection.trials - 1)
     if not steps:
         return Check("time of a step", "good", "none to measure: a session has one trial")
     from hilbo.session.choose.ask_tell import Session
@@ -256,7 +257,9 @@ def _stimulus(file: Any) -> Iterator[Check]:
     words += f"; values may be off by {off}" if off else ""
     try:
         table.check_shares(parameters)
-        yield _check("stimulus", words, file.tables.stimulus is None and "say so in a table [stimulus]", "note")
+        yield _check(
+            "stimulus", words, "stimulus" not in json.loads(file.content) and "say so in a table [stimulus]", "note"
+        )
     except InputError as error:
         yield Check("stimulus", "bad", str(error), "fix the study file")
     left = [key for key in ("title", "hello", "feel_reference", "feel_test") if key not in file.session.texts]

@@ -168,16 +168,17 @@ def _plan_of(path, kind, source, people, materials, paths, trials, session, seed
     from hilbo.session.plan.plan import make_plan
 
     with progress() as say:
-        study = _searchable(path) if kind == "optimisation" else _whole(path)
-        _say_delays(study, materials)
+        study = None if kind == "optimisation" else _whole(path)
+        file = _searchable(path) if study is None else study.file
+        _say_delays(file, materials)
         return make_plan(
-            study,
+            file,
             people,
             seed,
             kind,
             materials=materials,
             session=session or {"optimisation": "1", "validation": "2", "aggregate-best": "3"}[kind],
-            sets=None if kind == "optimisation" else _sets(study, kind, paths, trials, source, people, say),
+            sets=None if study is None else _sets(study, kind, paths, trials, source, people, say),
             source=source if kind == "validation" else None,
         )
 
@@ -224,9 +225,8 @@ def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
     """Material ("" without) -> the sets to compare."""
     from hilbo.session.export.tables import read_log_trials
     from hilbo.session.plan import validation_sets
-    from hilbo.study.cohort import cohort_of
+    from hilbo.study.cohort import cohort_of, read_trials
     from hilbo.study.results.result_json import read_result
-    from hilbo.study.tables.trials import read_trials
 
     sets = {}
     for material, path in paths.items():
@@ -238,9 +238,9 @@ def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
         validation_sets.check_participants(result, people, source)
         if trials is None:
             raise InputError("plan: a validation reads the map itself; give --trials, the answers it was made from.")
-        say(f"the map of {material or study.name}")
+        say(f"the map of {material or study.file.name}")
         if trials.is_dir():
-            table = read_log_trials(trials, study, material or None, note=remark)
+            table = read_log_trials(trials, study.file, material or None, note=remark)
         else:
             table = read_trials(trials, here, material or None)
         sets[material] = validation_sets.validation_sets(here, result, cohort_of(table, here), source, people)

@@ -63,7 +63,7 @@ def _simulate(preset, source, count, seed, folder, say) -> dict[str, Any]:
     from hilbo.simulation.folder import simulate_folder
 
     simulated = simulate_folder(folder, preset, count, seed, source)
-    chosen = selection_words(simulated.study.selection)
+    chosen = selection_words(simulated.study.file.selection)
     study, truth = simulated.study, simulated.truth
     content = aggregate_cohort(study, simulated.cohort, folder, seed, say, truth, selection=chosen)
     from hilbo.study.estimate.location import truth_sentence

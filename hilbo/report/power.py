@@ -45,7 +45,7 @@ def write_power(
         "seed": plan.seed,
         "rule": study.rule,
         "inference": study.inference,
-        "study": study.hash,
+        "study": study.file.hash,
         "versions": versions(),
         "warnings": [],
     } | cost

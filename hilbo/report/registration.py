@@ -111,7 +111,7 @@ def selection_words(selection: Any) -> str:
 
 
 def _exclusion(study: StudyFile) -> list[str]:
-    rule, flags = study.tables.study.exclude, ", ".join(study.exclude_flags).replace("_", " ")
+    rule, flags = study.exclude, ", ".join(study.exclude_flags).replace("_", " ")
     trials = f"Trials with these device flags are excluded: {flags} (`[study] exclude_flags`)."
     if rule:
         people = f"Participants for whom `{rule}` holds are left out (`[study] exclude`)."
@@ -121,7 +121,7 @@ def _exclusion(study: StudyFile) -> list[str]:
 
 
 def _analysis(study: StudyFile) -> list[str]:
-    rule = RULES[study.tables.aggregation.rule]
+    rule = RULES[study.rule]
     effect = study.random_effect
     return [
         f"* Population map: {rule.description} (`{rule.name}`), by hilbo's documentation of that version.",
@@ -136,7 +136,7 @@ def _analysis(study: StudyFile) -> list[str]:
 
 
 def _model(study: StudyFile) -> str:
-    gp = study.tables.gp
+    gp = study.gp
     given = {
         "theta": gp.theta,
         "variance": gp.variance,

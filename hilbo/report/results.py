@@ -103,7 +103,7 @@ def result(
         "random_effect": None if whole is None else _random_effect(study, whole),
         "heterogeneity": heterogeneity(aggregate),
         "inference": study.inference,
-        "study": study.hash,
+        "study": study.file.hash,
         "seed": seed,
         "versions": versions(),
     }

@@ -113,7 +113,7 @@ def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int
             "thresholds": np.asarray(model.likelihood.thresholds).tolist(),
         },
         "sensitivity": {name: np.asarray(block).tolist() for name, block in check.sensitivity.items()},
-        "study": study.hash,
+        "study": study.file.hash,
         "seed": seed,
         "versions": versions(),
     }

@@ -230,8 +230,8 @@ def write_validation(
         pictures = save_figures(validation_figures(validated), material_folder)
         contents.append(validation_content(validated))
         sections.append(validation_section(validated) | {"figures": pictures})
-    flags = flag_sentences_of(table, study.exclude_flags, "comparisons")
-    content = {"materials": contents, "study": study.hash, "seed": seed, "versions": versions()}
+    flags = flag_sentences_of(table, study.file.exclude_flags, "comparisons")
+    content = {"materials": contents, "study": study.file.hash, "seed": seed, "versions": versions()}
     content["warnings"] = [*flags, *named_warnings(dict(zip(names, contents, strict=True)))]
     (folder / "result.json").write_text(as_json(content), encoding="utf-8")
     page = rendered("validation.html", study=study, content=content, warnings=flags, sections=sections)
@@ -242,9 +242,9 @@ def write_validation(
 def _read(path: Path, study: Study, material: str | None) -> pd.DataFrame:
     """The comparisons of all materials, or of one."""
     if material is not None:
-        return read_validation(path, study.responses, material, study.exclude_flags)
+        return read_validation(path, study.responses, material, study.file.exclude_flags)
     cells = read_cells(path, "a validation table needs a header and a comparison")
-    return check_validation(cells, study.responses, str(path), study.exclude_flags)
+    return check_validation(cells, study.responses, str(path), study.file.exclude_flags)
 
 
 def named_warnings(contents: Mapping[Any, Mapping[str, Any]]) -> list[str]:

@@ -84,7 +84,7 @@ def simulate_power(
     """
     _check_rule(study.rule, plan)
     jobs = min(cores() if jobs is None else jobs, plan.studies)
-    sent = study.content, study.rule, population_, plan
+    sent = study.file.content, study.rule, population_, plan
     blocks: dict[int, pd.DataFrame] = {}
     with _pool(jobs, begin) as pool:  # of one process too: several cores add up in another order
         work = {pool.submit(_study_in_process, *sent, i): i for i in range(plan.studies)}
@@ -142,7 +142,7 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
     seed = int(np.random.default_rng([plan.seed, index]).integers(2**31))
     staged = _with_trials(study, longest)
     # A drift over the study's own session, told per trial, is this much over the longest one.
-    scale = longest / study.selection.trials
+    scale = longest / study.file.selection.trials
     population_ = with_truth(study, population_, seed)
     persons = people(staged, population_, most, seed)
     persons = eqx.tree_at(lambda p: p.drift, persons, persons.drift * scale)
@@ -188,9 +188,9 @@ def _map_top_probability(study: Study, map_: RuleMap, points: Float[Array, "m d"
 
 def _with_trials(study: Study, trials: int) -> Study:
     """The study with another number of trials."""
-    content = json.loads(study.content)
+    content = json.loads(study.file.content)
     content.setdefault("selection", {})["trials"] = trials
-    filling = min(study.selection.space_filling, trials)
+    filling = min(study.file.selection.space_filling, trials)
     content["selection"]["space_filling"] = filling
     return by_rule(Study.from_dict({"schema": 1} | content), study.rule)
 

@@ -51,11 +51,10 @@ def population_of(study: Study, preset: str | None = None) -> tuple[str, Populat
     parameters."""
     paper = PRESETS["paper"]
     fits = _of_these_ranges(study, paper) and len(study.responses) == 1 + len(paper.criteria)
-    if preset is None and not (study.simulation is None and fits):
-        words = (
-            "the study's [simulation]" if study.simulation else "people of no preset, with the defaults of [simulation]"
-        )
-        return words, _stated(study, study.simulation or SimulationTable())
+    if preset is None and not (study.file.simulation is None and fits):
+        stated = study.file.simulation
+        words = "the study's [simulation]" if stated else "people of no preset, with the defaults of [simulation]"
+        return words, _stated(study, stated or SimulationTable())
     name = preset or "paper"
     population = preset_of(name)
     if not _of_these_ranges(study, population):

@@ -161,7 +161,7 @@ def _simulate(
 ) -> Trials:
     """Everybody's session at once: the trials `initial` first, then those that the acquisition chooses. `answering` are
     the keys of people's answers, `drawing` those of the acquisition's draws, if it makes any."""
-    trials = study.selection.trials
+    trials = study.file.selection.trials
 
     def answered(state, point, trial):
         def one(person, key, data, x):
@@ -200,8 +200,8 @@ def to_table(study: Study, trials: Trials) -> pd.DataFrame:
     )
     for i, p in enumerate(study.space.parameters):
         table[p.name] = p.column(physical[..., i][tuple(rows.T)])
-    if study.random_effect is not None:
-        table[study.random_effect] = "simulated"  # one level, and so no effect
+    if study.file.random_effect is not None:
+        table[study.file.random_effect] = "simulated"  # one level, and so no effect
     return table
 
 

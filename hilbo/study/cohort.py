@@ -1,7 +1,8 @@
 """The answers of a study's participants, padded to one capacity: from a trial table to what a batch of fits takes."""
 
 import dataclasses
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -11,7 +12,7 @@ import pandas as pd
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from hilbo.errors import InputError
+from hilbo.errors import InputError, warn_caller
 from hilbo.numerics.host import to_device
 from hilbo.numerics.rows import rows_of
 from hilbo.numerics.shown import has_values
@@ -20,9 +21,9 @@ from hilbo.ordinal_gp import Trials
 from hilbo.population.rules.registry import RULES
 from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
-from hilbo.study.tables.trials import checked_trials, is_checked
+from hilbo.study.tables.trials import checked_trials, is_checked, trial_table
 
-__all__ = ["Cohort", "cohort_of"]
+__all__ = ["Cohort", "cohort_of", "read_trials"]
 
 _LEVELS = 200  # of a random effect
 
@@ -86,6 +87,27 @@ class Cohort(eqx.Module):
         return np.asarray(self.trials.mask).sum(axis=1)
 
 
+def read_trials(
+    path: str | os.PathLike,
+    study: Study,
+    material: str | None = None,
+    *,
+    others: bool = True,
+    say: Callable[[int], None] = lambda rows: None,
+    note: Callable[[str], object] = warn_caller,
+) -> pd.DataFrame:
+    """The rows of a trial table that are to be fitted, in the order of their keys within each participant.
+
+    Adds the column `category` (0 = lowest response); of a level its place in the list stands in its parameter's column.
+    Warm-up, repeated and voided rows are checked and left out, and so are those with a flag that the study excludes.
+
+    **Arguments:** `path`: a CSV or Parquet file. `material`: only its rows; needed if there are several. `others`: keep
+    the columns that hilbo does not use. `say`: called with the number of rows read so far. `note`: called with a
+    sentence on participants without a response that counts; by default a warning. Raises `InputError`.
+    """
+    return trial_table(path, study.file, material, others=others, say=say, note=note)
+
+
 def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:
     """Participants from a trial table: one that `tables.trials.read_trials` made, whose rows stay in their order, that
     of the answers; or a DataFrame of yours with the same columns, which is checked and put in order as a file is. So
@@ -94,12 +116,12 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     `capacity` defaults to the study's number of trials, or to the most answers of a participant if that is more.
     Raises `InputError` for a table that is none of the study's, and a `capacity` that somebody's answers exceed.
     """
-    if not isinstance(table, pd.DataFrame) or not is_checked(table, study):
-        table = checked_trials(_as_in_a_file(table, study), study)
+    if not isinstance(table, pd.DataFrame) or not is_checked(table, study.file):
+        table = checked_trials(_as_in_a_file(table, study), study.file)
     person, names = pd.factorize(table["participant"])
     counts = np.bincount(person)
     longest = int(counts.max())
-    capacity = max(longest, study.selection.trials) if capacity is None else capacity
+    capacity = max(longest, study.file.selection.trials) if capacity is None else capacity
     if capacity < longest:
         raise InputError(f"cohort_of: capacity is {capacity}, but {longest} answers of a participant need as many.")
     order = np.argsort(person, kind="stable")
@@ -154,7 +176,7 @@ def _as_in_a_file(table: pd.DataFrame, study: Study) -> pd.DataFrame:
 def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:
     """Each row's level of the study's random effect; None where the study names none or all are of one level. Raises
     InputError where a rule that learns misses the column, and where there are too many levels to be some."""
-    column = study.random_effect
+    column = study.file.random_effect
     if column is None or (column not in table and not RULES[study.rule].learns):
         return None
     if column not in table:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
@@ -13,49 +14,29 @@ from hilbo.population.learnt.posterior import NOTHING, Stated, every_theta, prio
 from hilbo.population.learnt.rule import Learnt
 from hilbo.population.rules.registry import RULES
 from hilbo.search.space import SearchSpace
-from hilbo.study.file.protocols import SessionTable
-from hilbo.study.file.reading import StudyFile, checked, hash_of, made_of_material, materials_in, read_study
-from hilbo.study.file.schema import Inference, ReportTable, Selection
-from hilbo.study.file.simulated_people import SimulationTable
-from hilbo.study.file.stimuli import StimulusTable
+from hilbo.study.file.reading import StudyFile, checked, read_study
+from hilbo.study.file.schema import Inference
 
 __all__ = ["RBF", "OrdinalGP", "OrdinalProbit", "Study"]
 
 
 class Study(eqx.Module):
-    """What is asked, over which space, with which model: everything but the answers.
+    """A study file with its search space and its model, ready to be computed with.
 
-    `gp` holds arrays and may be differentiated; all else is static. `source` is the file it came from, `hash`
-    identifies its content.
+    `gp` holds arrays and may be differentiated; all else but `learnt` is static.
     """
 
     gp: OrdinalGP
     space: SearchSpace
-    name: str = eqx.field(static=True)
-    responses: tuple[str, ...] = eqx.field(static=True)
-    attribute: str = eqx.field(static=True)
-    """What is judged, in words: labels of axes."""
-    exclude: str = eqx.field(static=True)
-    """The rule by which people are left out (`hilbo.population.judged.response_quality`), empty for nobody."""
-    exclude_flags: tuple[str, ...] = eqx.field(static=True)
-    """Flags of the device for which an analysis leaves a trial out (`hilbo.study.file.trial_flags`)."""
-    selection: Selection = eqx.field(static=True)
-    inference: Inference = eqx.field(static=True)
+    file: StudyFile = eqx.field(static=True)
+    """All that the study file contains: responses, selection, texts and so on."""
     rule: str = eqx.field(static=True)
-    random_effect: str | None = eqx.field(static=True)
-    """The column of the answers' table whose levels have an effect of their own, by a rule that learns it."""
-    source: str = eqx.field(static=True)
-    content: str = eqx.field(static=True, repr=False)  # the parsed file as JSON
-    session: SessionTable = eqx.field(static=True, repr=False, default=SessionTable())
-    report: ReportTable = eqx.field(static=True, repr=False, default=ReportTable())
-    stimulus: StimulusTable | None = eqx.field(static=True, repr=False, default=None)
-    """What is asked of the program that presents the renderings; None where a device does."""
-    simulation: SimulationTable | None = eqx.field(static=True, repr=False, default=None)
-    """Of whom `hilbo simulate` and `hilbo power` draw people, if the file states it."""
+    """The method that aggregates participants: the file's, or one to compare with it."""
+    inference: Inference = eqx.field(static=True)
     stated: Stated = eqx.field(static=True, repr=False, default=NOTHING)
-    """What the file states of the model, where the rule learns the rest; and of levels, whatever the rule."""
+    """What the file specifies of the model, where the method learns the rest; and of levels, whatever the method."""
     learnt: Learnt | None = eqx.field(repr=False, default=None)
-    """What was learnt from the answers, by a rule that learns; `gp` is then the learnt model, and before that the
+    """What was learnt from the responses, by a method that learns; `gp` is then the learnt model, and before that the
     priors' medians."""
 
     @staticmethod
@@ -73,50 +54,29 @@ class Study(eqx.Module):
         return checked(_plain(raw), source, Study.of)
 
     @staticmethod
+    @lru_cache(maxsize=32)
     def of(file: StudyFile) -> "Study":
         """The study of a file. Raises InputError if nothing in its box is passive."""
         gp, stated = _gp(file)
-        return Study(
-            gp=gp,
-            space=SearchSpace(file.space.parameters, file.space.mechanics, file.space.constraints),
-            name=file.name,
-            responses=file.responses,
-            attribute=file.tables.study.attribute,
-            exclude=file.tables.study.exclude,
-            exclude_flags=file.exclude_flags,
-            selection=file.selection,
-            inference=file.tables.gp.inference,
-            rule=file.tables.aggregation.rule,
-            random_effect=file.random_effect,
-            source=file.source,
-            content=file.content,
-            session=file.session,
-            report=file.tables.report,
-            stimulus=file.stimulus,
-            simulation=file.tables.simulation,
-            stated=stated,
-        )
+        space = SearchSpace(file.space.parameters, file.space.mechanics, file.space.constraints)
+        return Study(gp, space, file, file.rule, file.gp.inference, stated)
 
     def __repr__(self) -> str:
         ranges = ", ".join(
             f"{p.name} {p.range_words}" if p.levels else f"{p.name} {p.low:g} to {p.high:g} {p.unit}".rstrip()
             for p in self.space.parameters
         )
-        return f'Study("{self.name}": {ranges}; {", ".join(self.responses)}; rule {self.rule}; hash {self.hash})'
+        labels = ", ".join(self.responses)
+        return f'Study("{self.file.name}": {ranges}; {labels}; rule {self.rule}; hash {self.file.hash})'
 
     @property
-    def hash(self) -> str:
-        """First 16 hex digits of the SHA-256 of the content."""
-        return hash_of(self.content)
-
-    @property
-    def materials(self) -> tuple[str, ...]:
-        """Names of the materials that override the renderer or the parameters."""
-        return materials_in(self.content)
+    def responses(self) -> tuple[str, ...]:
+        """Labels of the responses, lowest first."""
+        return self.file.responses
 
     def material(self, name: str) -> "Study":
-        """The study of one material: its overrides of [renderer] and [parameters] applied."""
-        return made_of_material(self.content, self.source, name, Study.of)
+        """The study of one material: its overrides of [renderer] and [parameters] applied. Raises `InputError`."""
+        return Study.of(self.file.material(name))
 
 
 def _plain(raw: Any) -> Any:
@@ -130,12 +90,12 @@ def _plain(raw: Any) -> Any:
 
 def _gp(file: StudyFile) -> tuple[OrdinalGP, Stated]:
     """The model of [gp], and what the file states of it; a rule that learns takes the priors' medians for the rest."""
-    table, parameters = file.tables.gp, file.space.parameters
+    table, parameters = file.gp, file.space.parameters
     numbers = sum(not p.levels for p in parameters)
     levels = tuple(Levels(p.steps, p.correlation) if p.levels else None for p in parameters)
     levels = levels if numbers < len(parameters) else ()
     theta, variance, thresholds, noise = table.theta, table.variance, table.thresholds, table.noise
-    if RULES[file.tables.aggregation.rule].learns:
+    if RULES[file.rule].learns:
         lengths = theta if theta is None or isinstance(theta, tuple) else (theta,) * numbers
         stated = Stated(lengths, variance, thresholds, noise, levels)
         return prior_model(len(parameters), len(file.responses), stated), stated

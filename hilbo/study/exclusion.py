@@ -25,10 +25,11 @@ class Included(NamedTuple):
 def included(study: Study, everybody: Cohort) -> Included:
     """The cohort without those whom the study's rule leaves out. Raises `InputError` if it leaves nobody."""
     people = measure_people(study.gp, everybody.trials, everybody.names)
-    left_out = excluded(people, study.exclude)
+    left_out = excluded(people, study.file.exclude)
     if len(left_out) == len(everybody.names):
         raise InputError(
-            f'the rule "{study.exclude}" leaves out all {len(left_out)} participants; there is nothing to aggregate.'
+            f'the rule "{study.file.exclude}" leaves out all {len(left_out)} participants; there is nothing to'
+            " aggregate."
         )
     cohort = everybody.of([name for name in everybody.names if name not in left_out]) if left_out else everybody
     return Included(cohort, people, left_out)
@@ -39,4 +40,4 @@ def exclusion_sentences(study: Study, left_out: dict[str, str]) -> list[str]:
     if not left_out:
         return []
     who = "; ".join(f"{name} ({why.partition(', and')[0]})" for name, why in left_out.items())
-    return [f'[study] exclude = "{study.exclude}" leaves out {len(left_out)}: {who}.']
+    return [f'[study] exclude = "{study.file.exclude}" leaves out {len(left_out)}: {who}.']

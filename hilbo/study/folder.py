@@ -28,7 +28,7 @@ from hilbo.study.departures import PHASE, Held, departures
 from hilbo.study.file.trial_flags import FlagCounts, flag_sentences
 from hilbo.study.formats.csv_file import numbers, parameter_values, read_cells
 from hilbo.study.tables.flag_counts import flag_counts, with_flag_counts
-from hilbo.study.tables.trials import NothingToFitError, check_texts, marked, ordered, read_trials
+from hilbo.study.tables.trials import NothingToFitError, check_texts, marked, ordered, trial_table
 from hilbo.study.tables.validation import check_validation, sets_frame
 
 __all__ = ["Material", "StudyFolder", "read_folder"]
@@ -90,7 +90,7 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     materials = [_material(name, study, trials, compared, sets, truth) for name in names]
     departs, as_planned = _departures(folder, study, materials)
     limits = (*departs, *_missing_tables(study, materials, compared, sets))
-    flags = flag_sentences(flag_counts(*validation), study.exclude_flags, "comparisons") if validation else []
+    flags = flag_sentences(flag_counts(*validation), study.file.exclude_flags, "comparisons") if validation else []
     return StudyFolder(study, materials, sets, limits, (*as_planned, *flags))
 
 
@@ -98,9 +98,9 @@ def _with_exclusion(study: Study, exclude: str | None) -> Study:
     """The study with another rule of exclusion."""
     if exclude is None:
         return study
-    content = {"schema": 1} | json.loads(study.content)
+    content = {"schema": 1} | json.loads(study.file.content)
     content["study"] |= {"exclude": exclude}
-    return Study.from_dict(content, study.source)
+    return Study.from_dict(content, study.file.source)
 
 
 def _table_paths(folder: Path, stem: str) -> list[Path]:
@@ -130,7 +130,7 @@ def _validation(path: Path, study: Study) -> pd.DataFrame:
         read_cells(path, "a validation table needs a header and a comparison"),
         study.responses,
         str(path),
-        study.exclude_flags,
+        study.file.exclude_flags,
     )
 
 
@@ -140,14 +140,14 @@ def _material_names(study: Study, paths: list[Path]) -> list[str]:
     for path in paths:
         cells = read_cells(path)
         named += list(pd.unique(cells["material"])) if "material" in cells else [""]
-    ordered = [name for name in study.materials if name in named] + [
-        n for n in dict.fromkeys(named) if n not in study.materials
+    ordered = [name for name in study.file.materials if name in named] + [
+        n for n in dict.fromkeys(named) if n not in study.file.materials
     ]
     if "" in ordered and len(ordered) > 1:
         raise InputError(f"{paths[0]}: some rows name a material and some do not; name it in every row of every table.")
-    unknown = [name for name in ordered if name and study.materials and name not in study.materials]
+    unknown = [name for name in ordered if name and study.file.materials and name not in study.file.materials]
     if unknown:
-        listed = ", ".join(study.materials)
+        listed = ", ".join(study.file.materials)
         raise InputError(f'{paths[0]}: material "{unknown[0]}" is not in the study file, which has {listed}.')
     return ordered
 
@@ -176,14 +176,14 @@ def _material(
     truth: pd.DataFrame | None,
 ) -> Material:
     """One material's rows of all tables, and its reference."""
-    material_study = study.material(name) if name in study.materials else study
+    material_study = study.material(name) if name in study.file.materials else study
     table = _answers(name, material_study, paths)
     _check_answers_once(table, paths[0])
     if compared is not None and name and "material" in compared:
         compared = compared[compared["material"] == name]
     reference, words = _reference(material_study, name, sets, truth)
     validation = None if compared is None or compared.empty else compared
-    cohort = cohort_of(marked(table, material_study), material_study)  # each table was checked as it was read
+    cohort = cohort_of(marked(table, material_study.file), material_study)  # each table was checked as it was read
     return Material(name, material_study, cohort, validation, reference, words, flag_counts(table))
 
 
@@ -194,7 +194,7 @@ def _answers(name: str, study: Study, paths: list[Path]) -> pd.DataFrame:
         cells = read_cells(path)
         if name in (set(cells["material"]) if "material" in cells else {""}):
             try:
-                tables.append(read_trials(path, study, name or None, others=False))
+                tables.append(trial_table(path, study.file, name or None, others=False))
             except NothingToFitError as error:
                 empty.append(error)
     if not tables:
@@ -264,7 +264,7 @@ def _departures(folder: Path, study: Study, materials: list[Material]) -> tuple[
         answers = Counter(dict(zip(material.cohort.names, material.cohort.counts().tolist(), strict=True)))
         for name, count in (answers + Counter(material.flags.excluded)).items():
             counts.setdefault(name, []).append(count)
-    return departures(path, study.hash, study.selection.trials, counts, _held(folder))
+    return departures(path, study.file.hash, study.file.selection.trials, counts, _held(folder))
 
 
 def _held(folder: Path) -> list[Held] | None:
@@ -286,7 +286,7 @@ def _missing_tables(
 ) -> tuple[str, ...]:
     """What the folder's tables cannot say, in sentences."""
     sentences = []
-    if study.materials and materials[0].name == "":
+    if study.file.materials and materials[0].name == "":
         sentences.append("The tables name no material; they are read by the study's own, and none of [materials].")
     if compared is None:
         sentences.append(

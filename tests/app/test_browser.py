@@ -36,10 +36,10 @@ def test_a_whole_session_by_one_command(tmp_path, kind, trials):
     assert {name.split("-")[0] for name in summary["screens"]} == {"participant", "experimenter"}
     assert any("800x1280" in name for name in summary["screens"])
     study = Study.load(tmp_path / "out" / "study.toml")
-    _, events, dropped = read_log(summary["log"], study)
+    _, events, dropped = read_log(summary["log"], study.file)
     assert dropped == ""
     assert sum(event.kind == "answer" for event in events) == 3 + trials
-    with EventLog.resume(summary["log"], study) as log:
+    with EventLog.resume(summary["log"], study.file) as log:
         assert log.state.screen == "done"
 
 

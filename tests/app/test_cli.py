@@ -97,7 +97,7 @@ def test_a_study_is_made_fast_whether_it_has_steps_or_not(tmp_path):
     text = study_text(NewStudy("s", (parameter_of("texture=silk,wood"), parameter_of("gain=0:1:N"))))
     for source in (text, text.partition("[session]")[0]):
         (tmp_path / "base.toml").write_text(source)
-        session = Study.load(fast_study(tmp_path / "base.toml", tmp_path / "fast.toml", 0.1, 2)).session
+        session = Study.load(fast_study(tmp_path / "base.toml", tmp_path / "fast.toml", 0.1, 2)).file.session
         for phase in ("warm-up", "optimisation", "validation", "aggregate-best"):
             assert {step.seconds for step in protocol(session, phase).steps} == {0.1}
 
@@ -141,7 +141,7 @@ def test_each_session_of_a_person_has_keys_of_its_own(tmp_path, monkeypatch):
     study = study_of(tmp_path)
     plans = {label: tmp_path / f"plan {label}.json" for label in ("1", "2")}
     for label, path in plans.items():
-        path.write_text(json.dumps(make_plan(study, ["P01"], session=label)))
+        path.write_text(json.dumps(make_plan(study.file, ["P01"], session=label)))
     file, logs = tmp_path / "study.toml", tmp_path / "logs"
     place = (file, "--logs", logs, "--port", 0, "--dry-run", "--participant")
     first = served(monkeypatch, *place, "P01", "--plan", plans["1"])
@@ -186,8 +186,12 @@ def begun(wanted):
 def test_a_warm_start_is_in_the_log_and_a_resumed_session_chooses_the_same(tmp_path):
     study = study_of(tmp_path)
     file, logs = a_map(study, tmp_path / "map.nc"), tmp_path / "logs"
-    header = header_for(study, "P01", seed=7, warm=False)
-    plan = {"schema": 1, "study": study.hash, "participants": [{"participant": "P01", "header": to_builtins(header)}]}
+    header = header_for(study.file, "P01", seed=7, warm=False)
+    plan = {
+        "schema": 1,
+        "study": study.file.hash,
+        "participants": [{"participant": "P01", "header": to_builtins(header)}],
+    }
     (tmp_path / "plan.json").write_text(json.dumps(plan | {"hash": plan_hash(plan)}))
     wanted = Wanted(
         tmp_path / "study.toml", "P01", logs=logs, plan=tmp_path / "plan.json", warm_start=file, dry_run=True
@@ -212,7 +216,7 @@ def test_a_warm_start_that_is_refused_leaves_no_log(tmp_path):
     with pytest.raises(InputError, match="is no map"):
         opened(wanted, lambda *_: None, lambda *_: None)
     plan = make_plan(
-        study, ["P01"], 0, "validation", sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
+        study.file, ["P01"], 0, "validation", sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
     )
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     planned = wanted._replace(plan=tmp_path / "plan.json", warm_start=a_map(study, tmp_path / "map.nc"))
@@ -280,7 +284,7 @@ def test_options_that_contradict_the_plan_are_refused_and_another_label_begins_i
     study_of(tmp_path)
     file, path = tmp_path / "study.toml", tmp_path / "plan.json"
     file.write_text(file.read_text() + "\n[materials.foam]\n[materials.gel]\n")
-    plan = make_plan(Study.load(file), ["P01"], 5, materials=["gel"], session="gel")
+    plan = make_plan(Study.load(file).file, ["P01"], 5, materials=["gel"], session="gel")
     path.write_text(json.dumps(plan))
     seed = plan["participants"][0]["header"]["seed"]
     wanted = Wanted(file, "P01", logs=tmp_path / "logs", plan=path, dry_run=True)
@@ -305,7 +309,7 @@ def test_options_that_contradict_the_plan_are_refused_and_another_label_begins_i
 def test_a_session_is_resumed_by_a_plan_that_replaces_its_own(tmp_path):
     study = study_of(tmp_path)
     file, path, logs = tmp_path / "study.toml", tmp_path / "plan.json", tmp_path / "logs"
-    plan = make_plan(study, ["P01", "P02", "P03"])
+    plan = make_plan(study.file, ["P01", "P02", "P03"])
     path.write_text(json.dumps(plan))
     wanted = Wanted(file, "P01", logs=logs, plan=path, dry_run=True)
     logs.mkdir()
@@ -317,8 +321,8 @@ def test_a_session_is_resumed_by_a_plan_that_replaces_its_own(tmp_path):
     changed = json.loads(path.read_text())
     assert len(changed["replaces"]) == 2
     for other in (
-        make_plan(study, ["P01"]),
-        make_plan(study, ["P01"], 1) | {"replaces": [plan["hash"]]},  # what was begun is not in it
+        make_plan(study.file, ["P01"]),
+        make_plan(study.file, ["P01"], 1) | {"replaces": [plan["hash"]]},  # what was begun is not in it
     ):
         path.write_text(json.dumps(other | {"hash": plan_hash(other)}))
         with pytest.raises(InputError, match="was begun by another plan"):

@@ -79,11 +79,11 @@ def test_killed_servers_lose_and_double_nothing(tmp_path, phase, share):
     arguments = [str(file), "--participant", "P01"]
     if phase == "validation":
         plan = make_plan(
-            study, ["P01"], 0, phase, sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
+            study.file, ["P01"], 0, phase, sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
         )
         (tmp_path / "plan.json").write_text(json.dumps(plan))
         arguments += ["--plan", str(tmp_path / "plan.json")]
-    logs = [finished(study, tmp_path / name, arguments, n, 0.8) for name, n in (("killed", kills), ("whole", 0))]
+    logs = [finished(study.file, tmp_path / name, arguments, n, 0.8) for name, n in (("killed", kills), ("whole", 0))]
     assert essence(logs[0]) == essence(logs[1])
 
 
@@ -91,7 +91,7 @@ def test_a_kill_while_a_device_of_its_own_renders_loses_not_even_the_click(tmp_p
     file = fast_study(DATA, tmp_path / "study.toml", 0.05, 2)
     study = Study.load(file)
     plan = make_plan(
-        study, ["P01"], 0, "validation", sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
+        study.file, ["P01"], 0, "validation", sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
     )
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     with contextlib.ExitStack() as ended:
@@ -121,6 +121,6 @@ def test_a_kill_while_a_device_of_its_own_renders_loses_not_even_the_click(tmp_p
         session.until(asked)
         assert session.waiting["trial"] != clicked["trial"]
         session.kill()
-    events = session.log(study)
+    events = session.log(study.file)
     assert [e.data["condition"] for e in events if e.kind == "device"] == ["ready", "stopped", "ready"]
     assert [e.data["id"] for e in events if e.kind == "answer"] == [1]

@@ -35,4 +35,4 @@ def test_the_session_stops_and_every_acknowledged_answer_is_in_the_copy(tmp_path
         live.until(lambda view: view["phase"] == "wait" and not view["may"]["begin"])
         live.until(lambda _: live.hub.rig.snapshot.state == "STOPPED", lambda: live.hub.rig.snapshot)
         (copy,) = live.path.parent.glob("*.rescued.jsonl")
-        assert sum(event.kind == "answer" for event in read_log(copy, live.study)[1]) == 2
+        assert sum(event.kind == "answer" for event in read_log(copy, live.study.file)[1]) == 2

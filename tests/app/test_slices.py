@@ -22,7 +22,7 @@ ONE = Study.from_dict(
 
 
 def test_one_parameter_has_one_slice_with_the_answers_up():  # compiles a step of its own: 3 s
-    state = LiveSession.start(ONE, header_for(ONE, "P01", warm=False))
+    state = LiveSession.start(ONE.file, header_for(ONE.file, "P01", warm=False))
     chooser = LiveChooser(state)
     maps = Maps(chooser)
     chooser.warm()

@@ -146,8 +146,8 @@ def take_part(live, ended, acknowledged):
 def check_confirmed(live):
     """At each answer in the log all that it is about had been confirmed in this presentation, near what was asked for;
     the state that the log ends in."""
-    header, events, _ = read_log(live.path, live.study)
-    state = LiveSession.start(live.study, header)
+    header, events, _ = read_log(live.path, live.study.file)
+    state = LiveSession.start(live.study.file, header)
     for event in events:
         if event.kind == "answer":
             trial = state.trial(event.data["id"])

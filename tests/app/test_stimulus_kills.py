@@ -19,7 +19,7 @@ from hilbo.app.rehearsal.robot import Client
 from hilbo.session.choose.choice import Answers
 from hilbo.session.log.event_log import read_log
 from hilbo.session.log.state import LiveSession
-from hilbo.study.config import Study
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.template import NewStudy, parameter_of, study_text
 
 KILLS = int(os.environ.get("HILBO_KILLS", "9"))
@@ -88,7 +88,7 @@ def test_killed_in_turn_they_lose_nothing_and_count_nothing_that_was_not_confirm
     text = text.replace("# tolerance = {", "tolerance = {").replace('"hue" = 0.36', '"hue" = 0.51')
     file = tmp_path / "study.toml"
     file.write_text(text)
-    study = Study.load(file)
+    study = StudyFile.load(file)
     session = Presented(tmp_path / "killed", [str(file), "--participant", "P01"])
     session.start()
     session.until(session.ready)

@@ -33,11 +33,11 @@ def test_names_are_told_confirmed_and_written(tmp_path):
         state = live.replayed()
         assert trials_table([state])["texture"].tolist() == list(LEVELS)
         live.replays()
-    netcdf([state], tmp_path / "trials.nc", live.study)
+    netcdf([state], tmp_path / "trials.nc", live.study.file)
     with xr.open_datatree(tmp_path / "trials.nc", engine="h5netcdf") as tree:
         texture = tree["constant_data"]["texture"]
         assert texture.values.tolist() == texture.attrs["levels"] == list(LEVELS)
-    psych_ds([state], tmp_path / "out", live.study)
+    psych_ds([state], tmp_path / "out", live.study.file)
     words = (tmp_path / "out" / "dataset_description.json").read_text()
     assert "Parameter, one of silk, wood, smooth stone" in words
 
@@ -62,8 +62,8 @@ def test_a_session_that_chooses_is_aggregated_from_its_table(tmp_path):
 def test_a_stand_in_presents_and_knows_what_by_place_in_the_list(tmp_path, by):
     more = 'by = "person"\n' if by == "person" else ""
     with LiveLevels(tmp_path, more=more, blocks=SINGLE) as live:
-        role = live.study.stimulus.role
-        with StandIn(live.study, live.place.link(role), role) as presents:
+        role = live.study.file.stimulus.role
+        with StandIn(live.study.file, live.place.link(role), role) as presents:
             all_answered(live)
             assert [presents.presented(k)["a"] for k in (1, 2, 3)] == list(live.sets().values())
             assert presents.presented(4) == {}

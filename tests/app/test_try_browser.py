@@ -113,7 +113,7 @@ def test_a_whole_session(served, tmp_path, width, height):
 def check_log(out, person):
     """That it says what the answers are, and has what the person said of each test."""
     (path,) = (out / "logs").glob("*.session.jsonl")
-    state = read_session(path, Study.load(out / "study.toml"))
+    state = read_session(path, Study.load(out / "study.toml").file)
     assert state.header.unblinded == "try" and state.screen == "done"
     answered = state.answers(0)
     assert len(answered) == TRIALS

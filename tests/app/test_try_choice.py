@@ -30,7 +30,7 @@ def by_chance(session: Session, person: Person, seed: int) -> np.ndarray:
 
 def errors(study: Study, seed: int) -> np.ndarray:
     """Of both optima: how far the curves are from the reference's, and the parameters, of their ranges (RMS)."""
-    reference, session = hidden_reference(study, seed), Session.start(study, seed)
+    reference, session = hidden_reference(study.file, seed), Session.start(study, seed)
     person, space = Person(reference), study.space
     truth = np.asarray(space.to_unit(np.array(list(reference.values()))))
     return np.array([

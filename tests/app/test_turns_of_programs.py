@@ -9,7 +9,7 @@ from live_stimulus import TEXT
 
 from hilbo.app.rigs.stimulus_rig import OverError, StimulusRig
 from hilbo.app.wire.messages import Hello, Report
-from hilbo.study.config import Study
+from hilbo.study.file.reading import StudyFile
 
 SILENCE = 1.05  # s; no sum of the tenths that pass
 DEEDS = st.tuples(st.integers(0, 2), st.sampled_from(["hello", "again", "report"]), st.integers(0, 12))
@@ -19,7 +19,7 @@ DEEDS = st.tuples(st.integers(0, 2), st.sampled_from(["hello", "again", "report"
 def study(tmp_path_factory):
     file = tmp_path_factory.mktemp("study") / "study.toml"
     file.write_text(TEXT.format(within=1.0, silence=SILENCE))
-    return Study.load(file)
+    return StudyFile.load(file)
 
 
 class Paced(asyncio.SelectorEventLoop):

@@ -3,7 +3,7 @@
 import pytest
 
 from hilbo.cli import doctor
-from hilbo.study.file.reading import StudyFile
+from hilbo.study.config import Study
 from hilbo.study.template import NewStudy, parameter_of, study_text
 
 
@@ -30,6 +30,6 @@ def test_what_no_session_can_write_to_is_a_fault(folder, name):
 def test_a_study_of_one_trial_has_no_step_to_measure(tmp_path):
     path = tmp_path / "study.toml"
     path.write_text(study_text(NewStudy("x", (parameter_of("a=0:2"),), trials=1)))
-    study = StudyFile.load(path)
-    assert study.selection.trials == 1
+    study = Study.load(path)
+    assert study.file.selection.trials == 1
     assert "none to measure" in doctor._step(study).words

@@ -62,12 +62,12 @@ def test_a_plan_is_written_once_and_can_be_reissued(hilbo, tmp_path):
     plan = json.loads(out)
     assert code == 0 and "complete blocks" in err and plan == json.loads((tmp_path / "plan.json").read_text())
     assert [row["participant"] for row in plan["participants"]] == ["P01", "P02", "P03"]
-    assert planned_header(plan, study, "P02").seed == plan["participants"][1]["header"]["seed"]
+    assert planned_header(plan, study.file, "P02").seed == plan["participants"][1]["header"]["seed"]
     code, _, err = hilbo("plan", "study.toml", "--participants", 3)
     assert code == 2 and "plan.json: exists already" in err
     assert hilbo("plan", "study.toml", "--reissue", "P02=P09")[0] == 0
     changed = json.loads((tmp_path / "plan.json").read_text())
-    assert planned_header(changed, study, "P09").seed == planned_header(plan, study, "P02").seed
+    assert planned_header(changed, study.file, "P09").seed == planned_header(plan, study.file, "P02").seed
     for again, sentence in (
         ("P01", "write OLD=NEW"),
         ("P01=", 'participant is ""'),
@@ -127,14 +127,14 @@ def a_result(study, **changes):
         {"participant": f"P0{i}", "trials": 6, "optimum": {"parameters": {"u": 0.2, "v": 0.1 * i}}} for i in (1, 2)
     ]
     optimum = {"parameters": {"u": 0.3, "v": 0.6}, "mean": 1.0}
-    return {"optimum": optimum, "participants": people, "study": study.hash, "seed": 0} | changes
+    return {"optimum": optimum, "participants": people, "study": study.file.hash, "seed": 0} | changes
 
 
 def test_nobody_is_given_a_row_to_validate_a_map_that_they_are_in(hilbo, tmp_path):
     (tmp_path / "study.toml").write_text(TOML.format(trials=6))
     study = Study.load("study.toml")
     sets = {name: {"u": u, "v": 0.5} for name, u in (("best", 0.1), ("mid", 0.5), ("worst", 0.9))}
-    plan = make_plan(study, ["V01", "V02"], 0, "validation", sets={"": sets}, source="aggregate")
+    plan = make_plan(study.file, ["V01", "V02"], 0, "validation", sets={"": sets}, source="aggregate")
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     (tmp_path / "result.json").write_text(json.dumps(a_result(study)))
     before = (tmp_path / "plan.json").read_bytes()
@@ -146,7 +146,7 @@ def test_nobody_is_given_a_row_to_validate_a_map_that_they_are_in(hilbo, tmp_pat
         code, _, err = hilbo("plan", "study.toml", "--reissue", *arguments)
         assert code == 2 and sentence in err and (tmp_path / "plan.json").read_bytes() == before
     assert hilbo("plan", "study.toml", "--reissue", "V02=V03", "--from", "result.json")[0] == 0
-    assert planned_header(json.loads((tmp_path / "plan.json").read_text()), study, "V03").participant == "V03"
+    assert planned_header(json.loads((tmp_path / "plan.json").read_text()), study.file, "V03").participant == "V03"
 
 
 def test_a_validation_of_two_materials_looks_for_somebody_new_in_both_maps(hilbo, tmp_path):
@@ -155,7 +155,7 @@ def test_a_validation_of_two_materials_looks_for_somebody_new_in_both_maps(hilbo
     study = Study.load("study.toml")
     sets = {name: {"u": u, "v": 0.5} for name, u in (("best", 0.1), ("mid", 0.5), ("worst", 0.9))}
     both = dict.fromkeys(("foam", "gel"), sets)
-    plan = make_plan(study, ["V01", "V02"], 0, "validation", sets=both, source="aggregate")
+    plan = make_plan(study.file, ["V01", "V02"], 0, "validation", sets=both, source="aggregate")
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     people = {"foam": ["P01"], "gel": ["P02"]}
     for name, ids in people.items():
@@ -225,12 +225,12 @@ def validation_log(folder, study, answered=True):
     folder.mkdir()
     driver = Driver("validation")
     blocks = driver.header.blocks[1:]
-    driver.header = msgspec.structs.replace(driver.header, study=study.hash, blocks=blocks)
-    driver.state = type(driver.state).start(study, driver.header)
+    driver.header = msgspec.structs.replace(driver.header, study=study.file.hash, blocks=blocks)
+    driver.state = type(driver.state).start(study.file, driver.header)
     driver.step()
     if answered:
         driver.finish()
-    with EventLog.create(folder / log_name(driver.header), study, driver.header) as log:
+    with EventLog.create(folder / log_name(driver.header), study.file, driver.header) as log:
         for event in driver.events:
             log.append(event)
 
@@ -243,13 +243,13 @@ def logs_of(folder, study, people, trials, **facts):
         blocks = (Block("optimisation", trials),)
         seed = int(person[1:])
         driver.header = msgspec.structs.replace(
-            driver.header, study=study.hash, participant=person, blocks=blocks, sets={}, seed=seed, **facts
+            driver.header, study=study.file.hash, participant=person, blocks=blocks, sets={}, seed=seed, **facts
         )
-        driver.state = type(driver.state).start(study, driver.header)
+        driver.state = type(driver.state).start(study.file, driver.header)
         driver.values = lambda trial, number: {"class_a": felt(trial.renderings["a"])}
         driver.step()
         driver.finish()
-        with EventLog.create(folder / log_name(driver.header), study, driver.header) as log:
+        with EventLog.create(folder / log_name(driver.header), study.file, driver.header) as log:
             for event in driver.events:
                 log.append(event)
 

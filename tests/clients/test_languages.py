@@ -136,7 +136,7 @@ def session(tmp_path):
     new = NewStudy("spring", (parameter_of("stiffness=0.1:2:N/mm"), parameter_of("damping=0.001:0.02:N.s/mm")))
     file = tmp_path / "study.toml"
     file.write_text(study_text(new).replace("seconds = 2", "seconds = 5"))
-    assert Study.load(file).stimulus.silence == SILENCE
+    assert Study.load(file).file.stimulus.silence == SILENCE
     running = Session(tmp_path / "session", [str(file), "--participant", "P01"])
     running.start()
     running.until(running.ready)

@@ -84,7 +84,7 @@ def exported():
     for kind, table in (("optimisation", trials_table), ("validation", sets_table)):
         driver = Driver(kind)
         driver.header = msgspec.structs.replace(driver.header, unblinded="the tester")
-        driver.state = type(driver.state).start(STUDY, driver.header)
+        driver.state = type(driver.state).start(STUDY.file, driver.header)
         driver.step()
         driver.do("answer", 1)
         driver.finish()

@@ -88,7 +88,7 @@ def test_the_content_is_what_stands_in_the_file(written):
     assert set(content["optimum"]["parameters"]) == set(study.space.names)
     assert sum(content["optimum"]["class_probabilities"].values()) == pytest.approx(1, abs=1e-12)
     assert [p["trials"] for p in content["participants"]] == [6, 6]
-    assert (content["study"], content["warnings"]) == (study.hash, [])
+    assert (content["study"], content["warnings"]) == (study.file.hash, [])
     assert {"hilbo", "jax", "jaxlib", "numpy", "python", "device", "dtype"} <= set(content["versions"])
 
 
@@ -103,7 +103,7 @@ def test_the_map_is_the_population_s(written):
     assert float(first["mean"]) == pytest.approx(float(mean[0]), abs=1e-12)
     assert float(first["variance"]) == pytest.approx(float(variance[0]), abs=1e-12)
     assert all(data[name].attrs["units"] == "mm" for name in names)
-    assert data.attrs["study"] == study.hash
+    assert data.attrs["study"] == study.file.hash
     for name in names if study.space.dim <= 3 else ():
         assert data[name].values[[0, -1]].tolist() == [1.0, 10.0]
 
@@ -138,7 +138,7 @@ def test_the_page_is_whole_and_needs_nothing_else(written):
     assert page.captions == 4 and page.heads > 10
     assert "://" not in text and "<script" not in text and "nan" not in text.lower().replace("base64", "")[:2000]
     assert ("truth" in text) == ("truth" in content)
-    assert study.hash in text and content["versions"]["jax"] in text
+    assert study.file.hash in text and content["versions"]["jax"] in text
 
 
 @pytest.mark.parametrize(

@@ -30,9 +30,9 @@ def driven(kind, doings):
 @settings(max_examples=150)
 def test_any_interleaving_replays_and_resumes_to_the_same_next_trial(kind, doings, cut):
     driver = driven(kind, doings)
-    assert LiveSession.fold(STUDY, driver.header, driver.events) == driver.state
+    assert LiveSession.fold(STUDY.file, driver.header, driver.events) == driver.state
     place = cut % (len(driver.events) + 1)
-    resumed = LiveSession.fold(STUDY, driver.header, driver.events[:place])
+    resumed = LiveSession.fold(STUDY.file, driver.header, driver.events[:place])
     following = driver.events[place] if place < len(driver.events) else None
     if following is not None and following.kind == "propose":
         assert live.propose(resumed, CHOOSER, following.time) == following
@@ -53,7 +53,7 @@ def test_whatever_is_done_answers_stay_and_rules_hold(kind, doings):
         planned = [t.planned for t in state.answers(block)]
         assert len(set(planned)) == len(planned) or planned[0] is None
     assert sum(t.status == "pending" for t in state.trials) <= 1
-    again = LiveSession.start(STUDY, driver.header)
+    again = LiveSession.start(STUDY.file, driver.header)
     for event in driver.events:
         if event.kind == "propose":
             gone = again.excluded(event.data["block"])
@@ -441,7 +441,7 @@ def test_sides_come_in_the_order_of_the_trial():
 def test_a_header_of_another_study_and_events_out_of_order_are_refused():
     other = Header(**{f: getattr(header(), f) for f in Header.__struct_fields__} | {"study": "0" * 16})
     with pytest.raises(InputError, match="belongs to a study of hash 0000"):
-        LiveSession.start(STUDY, other)
+        LiveSession.start(STUDY.file, other)
     driver = Driver()
     driver.step()
     with pytest.raises(InputError, match="does not follow event 1"):

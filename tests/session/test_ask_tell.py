@@ -97,7 +97,7 @@ def test_replay_in_another_process_gives_the_same_points_bit_for_bit():
 
 def test_every_point_is_feasible_and_the_session_ends(study, finished):
     session, asked = finished
-    assert len(asked) == study.selection.trials
+    assert len(asked) == study.file.selection.trials
     assert feasible(study, session.points)
     with pytest.raises(InputError, match="all 25 trials"):
         session.ask()
@@ -141,7 +141,7 @@ def test_padding_is_only_padding(study, finished):
 
 @pytest.mark.parametrize("kind", ["thompson", *(pytest.param(k, marks=deep) for k in DIFFERENTIABLE)])
 def test_other_acquisitions_choose_feasible_points(study, kind):
-    raw = json.loads(study.content) | {"schema": 1}
+    raw = json.loads(study.file.content) | {"schema": 1}
     raw["selection"] = {"acquisition": kind, "trials": 7}
     session, asked = run(Study.from_dict(raw))
     assert len(asked) == 7
@@ -165,7 +165,7 @@ def test_other_acquisitions_choose_the_best_by_their_score(kind):
 
 @deep
 def test_a_smallest_distance_keeps_trials_apart(study):
-    raw = json.loads(study.content) | {"schema": 1}
+    raw = json.loads(study.file.content) | {"schema": 1}
     raw["selection"] = {"minimum_distance": 0.2, "trials": 12}
     session, _ = run(Study.from_dict(raw))
     x = np.asarray(study.space.to_unit(session.points))
@@ -185,7 +185,7 @@ def test_where_no_point_keeps_the_distance_the_farthest_is_asked(kind):
     """After the first trial nothing is 0.9 away any more: each is as far from the others as a point can be."""
     small, x = liked_everywhere(kind, 0.9, 5)
     everywhere = np.asarray(small.space.candidates(2000, 1))
-    for n in range(small.selection.space_filling, 5):
+    for n in range(small.file.selection.space_filling, 5):
         gaps = np.linalg.norm(everywhere[:, None, :] - x[None, :n], axis=2).min(axis=1)
         assert np.linalg.norm(x[:n] - x[n], axis=1).min() > min(0.9, gaps.max()) - 0.06
 
@@ -194,7 +194,7 @@ def test_where_no_point_keeps_the_distance_the_farthest_is_asked(kind):
 def test_a_distance_is_kept(kind):
     """Answers that pull to one place do not bring trials nearer to each other."""
     small, x = liked_everywhere(kind, 0.15, 6)
-    for n in range(small.selection.space_filling, 6):
+    for n in range(small.file.selection.space_filling, 6):
         assert np.linalg.norm(x[:n] - x[n], axis=1).min() >= 0.15 - 1e-9
 
 

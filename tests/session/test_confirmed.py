@@ -26,8 +26,8 @@ ASKED = SETS["A"]
 
 def started():
     """A session whose first rendering is proposed."""
-    first = msgspec.structs.replace(header(), study=STUDY.hash, blocks=(Block("optimisation", 6),))
-    state = LiveSession.start(STUDY, first)
+    first = msgspec.structs.replace(header(), study=STUDY.file.hash, blocks=(Block("optimisation", 6),))
+    state = LiveSession.start(STUDY.file, first)
     return state.after(live.propose(state, CHOOSER, 1.0))
 
 
@@ -48,10 +48,10 @@ def test_a_value_is_taken_within_its_tolerance_and_nowhere_else(du, dv):
     values = {"u": ASKED["u"] + du, "v": ASKED["v"] + dv}
     off = {n: abs(values[n] - ASKED[n]) for n in "uv"}
     if off["u"] <= 0.01 and off["v"] <= 1e-6:
-        check_confirmed(STUDY, ASKED, values)
+        check_confirmed(STUDY.file, ASKED, values)
         return
     with pytest.raises(RefusedError, match="was asked for") as caught:
-        check_confirmed(STUDY, ASKED, values)
+        check_confirmed(STUDY.file, ASKED, values)
     assert caught.value.code == "off"
 
 
@@ -65,21 +65,21 @@ LOGARITHMIC = RAW | {
 def test_on_a_logarithmic_scale_a_share_of_the_value_may_be_off(wanted, stated, share):
     study = Study.from_dict(LOGARITHMIC | {"stimulus": {"tolerance": stated}})
     asked_for = ASKED | {"f": wanted}
-    check_confirmed(study, asked_for, asked_for | {"f": wanted * (1 + 0.99 * share)})
+    check_confirmed(study.file, asked_for, asked_for | {"f": wanted * (1 + 0.99 * share)})
     for factor in (1 + 1.01 * share, 1 - 1.01 * share):
         with pytest.raises(RefusedError, match="was asked for, and it may be off by"):
-            check_confirmed(study, asked_for, asked_for | {"f": wanted * factor})
+            check_confirmed(study.file, asked_for, asked_for | {"f": wanted * factor})
 
 
 def test_a_log_of_before_is_read_with_tolerances_in_the_unit_and_none_is_begun():
     study = Study.from_dict(LOGARITHMIC | {"stimulus": {"tolerance": {"f": 10.0}}})
     asked_for = ASKED | {"f": 1.5}
-    check_confirmed(study, asked_for, ASKED | {"f": 11.0}, schema=2)
+    check_confirmed(study.file, asked_for, ASKED | {"f": 11.0}, schema=2)
     with pytest.raises(RefusedError, match="may be off by 10 Hz"):
-        check_confirmed(study, asked_for, ASKED | {"f": 12.0}, schema=2)
+        check_confirmed(study.file, asked_for, ASKED | {"f": 12.0}, schema=2)
     with pytest.raises(InputError, match=r"tolerance.f is 10.0; on a logarithmic scale it is a share of the value"):
         check_new_header(
-            study, msgspec.structs.replace(header(), study=study.hash, sets={}, blocks=header().blocks[1:])
+            study.file, msgspec.structs.replace(header(), study=study.file.hash, sets={}, blocks=header().blocks[1:])
         )
 
 
@@ -88,13 +88,13 @@ def test_a_log_of_before_is_read_with_tolerances_in_the_unit_and_none_is_begun()
 )
 def test_what_is_no_confirmation_is_refused(values):
     with pytest.raises(RefusedError) as caught:
-        check_confirmed(STUDY, ASKED, values)
+        check_confirmed(STUDY.file, ASKED, values)
     assert caught.value.code == "bad-answer"
 
 
 @given(st.floats(-0.01, 1.01), st.floats(-0.01, 1.01))
 def test_what_counts_is_never_outside_the_ranges_and_nothing_else_is_changed(u, v):
-    confirmed = counted(STUDY, {"u": u, "v": v})
+    confirmed = counted(STUDY.file, {"u": u, "v": v})
     assert all(0.0 <= x <= 1.0 for x in confirmed.values())
     assert all(confirmed[n] == x for n, x in (("u", u), ("v", v)) if 0.0 <= x <= 1.0)
 
@@ -168,7 +168,7 @@ def test_a_bad_table_is_refused_in_one_sentence(table, words):
 def test_a_device_and_a_program_do_not_both_present():
     fosls = {n: {"low": 0.1, "high": 0.9} for n in ("K1", "B1", "alpha")}
     raw = RAW | {"parameters": fosls, "renderer": {"K_eff": 0.44, "damping": 0.95}}
-    assert Study.from_dict(raw).stimulus is None and Study.from_dict(RAW).stimulus is not None
+    assert Study.from_dict(raw).file.stimulus is None and Study.from_dict(RAW).file.stimulus is not None
     with pytest.raises(InputError, match="a study has one"):
         Study.from_dict(raw | {"stimulus": {}})
 
@@ -176,8 +176,8 @@ def test_a_device_and_a_program_do_not_both_present():
 def compared(study, off):
     """A session of one comparison, whose sides are confirmed a little off."""
     block = Block("validation", 1, (Planned("D", "E"),))
-    first = msgspec.structs.replace(header(), study=study.hash, blocks=(block,))
-    state = LiveSession.start(study, first)
+    first = msgspec.structs.replace(header(), study=study.file.hash, blocks=(block,))
+    state = LiveSession.start(study.file, first)
     state = state.after(live.propose(state, CHOOSER, 1.0))
     for step, (show, _) in enumerate(state.steps_of(state.pending)):
         values = SETS[{"a": "D", "b": "E"}.get(show, "D")]
@@ -194,7 +194,7 @@ def test_the_table_of_comparisons_has_what_was_confirmed_of_either_side(tmp_path
     assert row["presented_a_u"] == SETS["D"]["u"] + 0.004 and row["presented_b_u"] == SETS["E"]["u"] - 0.006
     assert row["presented_a_v"] == SETS["D"]["v"] and row["presented_b_v"] == SETS["E"]["v"]
     assert sets_table([state]).set_index("set_id").at["D", "u"] == SETS["D"]["u"]  # as it was planned
-    psych_ds([state], tmp_path, STUDY)
+    psych_ds([state], tmp_path, STUDY.file)
     sidecar = (tmp_path / "data" / "study-plain_table-validation_data.json").read_text()
     assert "What was confirmed as presented on side b, no unit" in sidecar
 
@@ -207,7 +207,7 @@ def test_confirmed_values_take_the_place_of_no_other_column():
     columns = [f"presented_{side}_{name}" for side in "ab" for name in study.space.names]
     values = {side: dict(zip(study.space.names, (0.1, 0.2, 0.3), strict=True)) for side in "ab"}
     trial = replace(trial, data=trial.data | {"renderings": values}, confirmed={})
-    state = SimpleNamespace(study=study, header=header("validation"), trials=[trial])
+    state = SimpleNamespace(study=study.file, header=header("validation"), trials=[trial])
     table = validation_table([state])
     assert [name for name in table if name.startswith("presented_")] == columns
     assert table["set_a"].tolist() == ["D"] and table["class_b"].tolist() == ["similar"]

@@ -43,7 +43,7 @@ def driven():
 
 
 def write(path, driver):
-    with EventLog.create(path, STUDY, driver.header) as log:
+    with EventLog.create(path, STUDY.file, driver.header) as log:
         for event in driver.events:
             log.append(event)
         assert log.state == driver.state
@@ -54,14 +54,14 @@ def test_a_log_reads_back_and_goes_on(tmp_path, driven):
     path = tmp_path / log_name(driven.header)
     write(path, driven)
     assert log_paths(tmp_path) == [path]
-    read_header, events, dropped = read_log(path, STUDY)
+    read_header, events, dropped = read_log(path, STUDY.file)
     assert (read_header, events, dropped) == (driven.header, driven.events, "")
-    with EventLog.resume(path, STUDY) as log:
+    with EventLog.resume(path, STUDY.file) as log:
         assert log.state == driven.state
         log.append(live.note(log.state, "again: ü, \n, \u2028", 1e9 + 0.1))
     assert read_log(path)[1][-1].data["text"] == "again: ü, \n, \u2028"
     first = path.read_bytes().split(b"\n")[0]
-    assert b'"schema":1,"study":"' + STUDY.hash.encode() in first
+    assert b'"schema":1,"study":"' + STUDY.file.hash.encode() in first
 
 
 @given(st.integers(0, 10**9))
@@ -77,11 +77,11 @@ def test_a_log_cut_anywhere_resumes_to_the_same_next_trial(tmp_path_factory, dri
         lines += 1  # its newline alone is missing
     if lines == 0:
         with pytest.raises(InputError, match="no whole first line"):
-            EventLog.resume(path, STUDY)
+            EventLog.resume(path, STUDY.file)
         return
-    with EventLog.resume(path, STUDY) as log:
+    with EventLog.resume(path, STUDY.file) as log:
         kept = driven.events[: lines - 1]
-        assert log.state == LiveSession.fold(STUDY, driven.header, kept)
+        assert log.state == LiveSession.fold(STUDY.file, driven.header, kept)
         good = b"".join(whole.splitlines(keepends=True)[:lines])
         assert bool(log.dropped) == (len(good) < cut)
         assert path.read_bytes() == good
@@ -97,12 +97,12 @@ def test_a_last_line_that_lacks_its_newline_counts_and_gets_it(tmp_path, driven)
     path = tmp_path / "log.jsonl"
     whole = write(path, driven)
     path.write_bytes(whole[:-1])
-    assert read_log(path, STUDY) == (driven.header, driven.events, "")
-    with EventLog.resume(path, STUDY) as log:
+    assert read_log(path, STUDY.file) == (driven.header, driven.events, "")
+    with EventLog.resume(path, STUDY.file) as log:
         assert log.state == driven.state and log.dropped == ""
         assert path.read_bytes() == whole
         log.append(live.note(log.state, "goes on", 1e9))
-    assert len(read_log(path, STUDY)[1]) == len(driven.events) + 1
+    assert len(read_log(path, STUDY.file)[1]) == len(driven.events) + 1
     lines = whole.splitlines(keepends=True)
     path.write_bytes(b"".join([*lines[:-2], lines[-1][:-1]]))
     with pytest.raises(InputError, match="does not follow"):
@@ -119,10 +119,10 @@ def test_a_newline_that_cannot_be_written_is_one_sentence_and_the_log_stays(tmp_
 
     monkeypatch.setattr(os, "write", full)
     with pytest.raises(InputError, match=r"log\.jsonl: cannot be written \(No space left"):
-        EventLog.resume(path, STUDY)
+        EventLog.resume(path, STUDY.file)
     monkeypatch.undo()
     assert path.read_bytes() == whole[:-1]
-    EventLog.resume(path, STUDY).close()  # nobody holds it
+    EventLog.resume(path, STUDY.file).close()  # nobody holds it
 
 
 @given(st.integers(0, 10**9), st.integers(1, 255))
@@ -136,7 +136,7 @@ def test_a_changed_byte_is_refused_with_its_line(tmp_path_factory, driven, numbe
     path = folder / "damaged.jsonl"
     path.write_bytes(content)
     with pytest.raises(InputError, match=rf"damaged\.jsonl:{line}: "):
-        EventLog.resume(path, STUDY)
+        EventLog.resume(path, STUDY.file)
     assert path.read_bytes() == content
 
 
@@ -159,14 +159,14 @@ def test_another_study_another_writer_and_other_files_are_refused(tmp_path, driv
     write(path, driven)
     other = Study.from_dict(RAW | {"gp": RAW["gp"] | {"theta": 11.0}})
     with pytest.raises(InputError, match="is the log of another study"):
-        EventLog.resume(path, other)
+        EventLog.resume(path, other.file)
     with pytest.raises(InputError, match="exists already"):
-        EventLog.create(path, STUDY, driven.header)
-    with EventLog.resume(path, STUDY), pytest.raises(InputError, match="written by another hilbo"):
-        EventLog.resume(path, STUDY)
-    EventLog.resume(path, STUDY).close()  # and is free again
+        EventLog.create(path, STUDY.file, driven.header)
+    with EventLog.resume(path, STUDY.file), pytest.raises(InputError, match="written by another hilbo"):
+        EventLog.resume(path, STUDY.file)
+    EventLog.resume(path, STUDY.file).close()  # and is free again
     with pytest.raises(InputError, match="no such session was begun"):
-        EventLog.resume(tmp_path / "none.jsonl", STUDY)
+        EventLog.resume(tmp_path / "none.jsonl", STUDY.file)
     for content, sentence in ((b"", "no whole first line"), (b"participant,trial\n", "is damaged")):
         path.write_bytes(content)
         with pytest.raises(InputError, match=sentence):
@@ -182,9 +182,9 @@ def test_a_log_that_was_killed_within_its_first_line_is_begun_again(tmp_path_fac
     path.write_bytes(whole[: number % (whole.index(b"\n") + 1)])
     assert not begun(path)
     assert log_paths(folder) == [folder / log_name(driven.header)]  # nobody's table waits for it
-    EventLog.create(path, STUDY, driven.header).close()
+    EventLog.create(path, STUDY.file, driven.header).close()
     assert begun(path)
-    assert read_log(path, STUDY) == (driven.header, [], "")
+    assert read_log(path, STUDY.file) == (driven.header, [], "")
 
 
 @pytest.mark.parametrize("content", [b"my notes", b"my notes\n", b'{"seq":0,"kind":"note"}'])
@@ -192,7 +192,7 @@ def test_what_is_no_beginning_of_a_log_is_not_written_over(tmp_path, driven, con
     path = tmp_path / "log.jsonl"
     path.write_bytes(content)
     with pytest.raises(InputError, match="exists already"):
-        EventLog.create(path, STUDY, driven.header)
+        EventLog.create(path, STUDY.file, driven.header)
     assert path.read_bytes() == content
 
 
@@ -200,15 +200,15 @@ def test_what_is_no_beginning_of_a_log_is_not_written_over(tmp_path, driven, con
 def test_a_writer_in_another_process_is_refused_too(tmp_path, driven):
     path = tmp_path / "log.jsonl"
     write(path, driven)
-    with EventLog.resume(path, STUDY):
-        code = CHILD + f"EventLog.resume({str(path)!r}, STUDY)"
+    with EventLog.resume(path, STUDY.file):
+        code = CHILD + f"EventLog.resume({str(path)!r}, STUDY.file)"
         run = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
         assert "written by another hilbo" in run.stderr
 
 
 def test_an_event_that_does_not_follow_is_not_written(tmp_path, driven):
     path = tmp_path / "log.jsonl"
-    with EventLog.create(path, STUDY, driven.header) as log:
+    with EventLog.create(path, STUDY.file, driven.header) as log:
         size = path.stat().st_size
         with pytest.raises(InputError, match="does not follow"):
             log.append(driven.events[3])
@@ -220,7 +220,7 @@ import resource, signal, os
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 path = sys.argv[1]
 driver = Driver()
-log = EventLog.create(path, STUDY, driver.header)
+log = EventLog.create(path, STUDY.file, driver.header)
 resource.setrlimit(resource.RLIMIT_FSIZE, (os.path.getsize(path) + 5000, resource.RLIM_INFINITY))
 try:
     while True:
@@ -242,14 +242,14 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(tmp_path):
     *told, sentence, last = run.stdout.splitlines()
     assert sentence.startswith("LogError") and "free some space" in sentence
     assert int(last) == int(told[-1]) + 1 and int(told[-1]) > 5
-    _, events, dropped = read_log(path, STUDY)
+    _, events, dropped = read_log(path, STUDY.file)
     assert dropped == "" and [event.seq for event in events] == list(range(1, int(last) + 1))
     assert events[-1].data["text"] == "space again"
 
 
 def test_a_failing_fsync_acknowledges_nothing(tmp_path, driven, monkeypatch):
     path = tmp_path / "log.jsonl"
-    with EventLog.create(path, STUDY, driven.header) as log:
+    with EventLog.create(path, STUDY.file, driven.header) as log:
         log.append(driven.events[0])
         state, size = log.state, path.stat().st_size
 
@@ -266,7 +266,7 @@ def test_a_failing_fsync_acknowledges_nothing(tmp_path, driven, monkeypatch):
 
 
 KILLED = """
-log = EventLog.resume(sys.argv[1], STUDY)
+log = EventLog.resume(sys.argv[1], STUDY.file)
 while True:
     log.append(live.note(log.state, "x" * (log.state.seq % 977), float(log.state.seq)))
     print(log.state.seq, flush=True)
@@ -277,7 +277,7 @@ while True:
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 def test_kill_9_while_appending_loses_nothing_acknowledged(tmp_path):
     path = tmp_path / "log.jsonl"
-    EventLog.create(path, STUDY, header()).close()
+    EventLog.create(path, STUDY.file, header()).close()
     rng, acknowledged = random.Random(0), 0
     for _ in range(12):
         command = [sys.executable, "-W", "ignore", "-c", CHILD + KILLED, str(path)]
@@ -288,7 +288,7 @@ def test_kill_9_while_appending_loses_nothing_acknowledged(tmp_path):
             child.send_signal(signal.SIGKILL)
             rest = [line for line in child.stdout.read().splitlines(keepends=True) if line.endswith("\n")]
             acknowledged = int(rest[-1]) if rest else acknowledged
-        _, events, _ = read_log(path, STUDY)
+        _, events, _ = read_log(path, STUDY.file)
         assert [event.seq for event in events] == list(range(1, len(events) + 1))
         assert len(events) in (acknowledged, acknowledged + 1)
 
@@ -296,7 +296,7 @@ def test_kill_9_while_appending_loses_nothing_acknowledged(tmp_path):
 def test_numbers_survive_a_log_bit_for_bit(tmp_path):
     values = [0.1, 1 / 3, 5e-324, 1.7976931348623157e308, -0.0, 123456789.123456789]
     path = tmp_path / "log.jsonl"
-    with EventLog.create(path, STUDY, header()) as log:
+    with EventLog.create(path, STUDY.file, header()) as log:
         log.append(Event(seq=1, kind="device", time=0.1 + 0.2, data={"condition": "ready", "trial": None, "v": values}))
     (event,) = read_log(path)[1]
     assert event.time == 0.1 + 0.2 and list(map(repr, event.data["v"])) == list(map(repr, values))

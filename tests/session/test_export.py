@@ -20,10 +20,9 @@ from hilbo.session.log.event_log import EventLog
 from hilbo.session.log.log_files import log_name
 from hilbo.session.plan.participants import add_person, check_consent, read_people
 from hilbo.session.withdrawal.withdrawal import delete_participant
-from hilbo.study.cohort import cohort_of
+from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.estimate.aggregate import fit_cohort
 from hilbo.study.results.arviz_groups import groups, write_groups
-from hilbo.study.tables.trials import read_trials
 from hilbo.study.tables.validation import read_validation, sets_frame
 
 
@@ -32,13 +31,13 @@ def write(folder, person, kind, session, doings=(), **facts):
 
     driver = Driver(kind)
     driver.header = msgspec.structs.replace(driver.header, participant=person, session=session, **facts)
-    driver.state = type(driver.state).start(STUDY, driver.header)
+    driver.state = type(driver.state).start(STUDY.file, driver.header)
     driver.step()
     for doing in doings:
         driver.do(*doing)
     driver.finish()
     folder.mkdir(exist_ok=True)
-    with EventLog.create(folder / log_name(driver.header), STUDY, driver.header) as log:
+    with EventLog.create(folder / log_name(driver.header), STUDY.file, driver.header) as log:
         for event in driver.events:
             log.append(event)
     return driver.state
@@ -49,7 +48,7 @@ def test_flags_are_columns_and_empty_where_there_is_no_record(tmp_path):
     answered = [trial for trial in state.trials if trial.values is not None]
     counts = [trial.telemetry for trial in answered]
     assert None in counts and {"samples": 8} in counts and {"samples": 8, "slewed": 1, "saturated": 2} in counts
-    psych_ds([state], tmp_path / "out", STUDY)
+    psych_ds([state], tmp_path / "out", STUDY.file)
     path = tmp_path / "out" / "data" / "study-plain_table-trials_data.csv"
     cells = pd.read_csv(path, dtype=str, keep_default_na=False)
     cell = {None: ("", ""), 1: ("", "8"), 3: ("saturated slewed", "8")}
@@ -57,12 +56,12 @@ def test_flags_are_columns_and_empty_where_there_is_no_record(tmp_path):
     assert list(zip(cells["flags"], cells["telemetry_samples"], strict=True)) == wanted
     leaves_out = Study.from_dict(RAW | {"study": RAW["study"] | {"exclude_flags": ["slewed"]}})
     kept = [t.number for t in answered if t.data["phase"] == "optimisation" and len(t.telemetry or {}) < 2]
-    assert netcdf([state], tmp_path / "trials.nc", leaves_out)
+    assert netcdf([state], tmp_path / "trials.nc", leaves_out.file)
     with xr.open_dataset(tmp_path / "trials.nc", group="constant_data", engine="h5netcdf") as constant:
         assert constant["trial"].values.tolist() == kept and 0 < len(kept) < 6
     leaves_out = Study.from_dict(RAW | {"study": RAW["study"] | {"exclude_flags": ["slewed"]}})
     kept = [t.number for t in answered if t.data["phase"] == "optimisation" and len(t.telemetry or {}) < 2]
-    assert netcdf([state], tmp_path / "trials.nc", leaves_out)
+    assert netcdf([state], tmp_path / "trials.nc", leaves_out.file)
     with xr.open_dataset(tmp_path / "trials.nc", group="constant_data", engine="h5netcdf") as constant:
         assert constant["trial"].values.tolist() == kept and 0 < len(kept) < 6
     sidecar = json.loads(path.with_suffix(".json").read_text())["variableMeasured"]
@@ -83,12 +82,15 @@ def folder(tmp_path):
 
 
 def test_logs_and_exported_table_give_the_same_bits(folder, tmp_path):
-    sessions = read_sessions(folder, STUDY)
+    sessions = read_sessions(folder, STUDY.file)
     out = tmp_path / "out"
-    psych_ds(sessions, out, STUDY)
+    psych_ds(sessions, out, STUDY.file)
     path = out / "data" / "study-plain_table-trials_data.csv"
     notes = []
-    direct, exported = read_log_trials(folder, STUDY, note=notes.append), read_trials(path, STUDY, note=notes.append)
+    direct, exported = (
+        read_log_trials(folder, STUDY.file, note=notes.append),
+        read_trials(path, STUDY, note=notes.append),
+    )
     of_logs, of_table = (note.partition(": ") for note in notes)
     assert (of_logs[0], of_table[0]) == (str(folder), str(path)) and of_logs[2] == of_table[2]
     assert of_logs[2].endswith("not fitted; P03 has no other answer in it.")  # who validated, after a warm-up
@@ -109,7 +111,7 @@ def test_logs_and_exported_table_give_the_same_bits(folder, tmp_path):
 
 
 def test_the_psych_ds_folder_describes_every_column(folder, tmp_path):
-    written = psych_ds(read_sessions(folder, STUDY), tmp_path / "out", STUDY)
+    written = psych_ds(read_sessions(folder, STUDY.file), tmp_path / "out", STUDY.file)
     description = json.loads((tmp_path / "out" / "dataset_description.json").read_text())
     measured = {variable["name"] for variable in description["variableMeasured"]}
     tables = [path for path in written if path.suffix == ".csv"]
@@ -128,11 +130,11 @@ def test_the_psych_ds_folder_describes_every_column(folder, tmp_path):
 
 def test_netcdf_is_read_by_xarray_and_arviz(folder, tmp_path):
     path = tmp_path / "trials.nc"
-    netcdf(read_sessions(folder, STUDY), path, STUDY)
+    netcdf(read_sessions(folder, STUDY.file), path, STUDY.file)
     tree = xr.open_datatree(path, engine="h5netcdf").load()
     assert tree["observed_data"]["category"].sizes == {"obs_id": 12}  # without the repetition, which is never fitted
     data = arviz.from_netcdf(str(path))
-    table = read_log_trials(folder, STUDY)
+    table = read_log_trials(folder, STUDY.file)
     assert set(data.constant_data["phase"].values) == {"optimisation"}
     assert sorted(data.constant_data["u"].values) == sorted(table["u"])
     assert data.observed_data["category"].values.sum() == table["category"].sum()
@@ -140,8 +142,8 @@ def test_netcdf_is_read_by_xarray_and_arviz(folder, tmp_path):
 
 
 def test_one_participant_is_deleted_from_everything(folder, tmp_path):
-    psych_ds(read_sessions(folder, STUDY), tmp_path / "out", STUDY)
-    netcdf(read_sessions(folder, STUDY), tmp_path / "out" / "trials.nc", STUDY)
+    psych_ds(read_sessions(folder, STUDY.file), tmp_path / "out", STUDY.file)
+    netcdf(read_sessions(folder, STUDY.file), tmp_path / "out" / "trials.nc", STUDY.file)
     people = tmp_path / "participants.csv"
     for person in ("P01", "P02", "P03"):
         add_person(people, {"participant": person, "consent_time": "2026-05-04T10:00", "protocol_number": "7"})
@@ -152,18 +154,18 @@ def test_one_participant_is_deleted_from_everything(folder, tmp_path):
         if path.suffix in (".csv", ".jsonl"):
             assert "P02" not in path.read_text()
     assert "P02" not in arviz.from_netcdf(str(tmp_path / "out" / "trials.nc")).constant_data["participant"].values
-    assert set(read_log_trials(folder, STUDY)["participant"]) == {"P01"}
+    assert set(read_log_trials(folder, STUDY.file)["participant"]) == {"P01"}
     with pytest.raises(InputError, match='nothing of participant "P02"'):
         delete_participant(tmp_path, "P02")
     with (
-        EventLog.resume(next(folder.glob("P01*")), STUDY),
+        EventLog.resume(next(folder.glob("P01*")), STUDY.file),
         pytest.raises(InputError, match="end the session first"),
     ):
         delete_participant(tmp_path, "P01")
 
 
 def test_a_participant_is_deleted_from_a_report_and_nothing_else_of_it_is(folder, capsys, monkeypatch, tmp_path):
-    cohort = cohort_of(read_log_trials(folder, STUDY), STUDY)
+    cohort = cohort_of(read_log_trials(folder, STUDY.file), STUDY)
     assert cohort.names == ("P01", "P02")
     path = tmp_path / "report" / "inference.nc"
     path.parent.mkdir()
@@ -216,35 +218,35 @@ def test_a_deletion_that_cannot_be_ended_begins_with_the_logs(folder, monkeypatc
 
 
 def test_dry_runs_are_nobodys_answers(folder, tmp_path):
-    before, heard = read_log_trials(folder, STUDY), []
+    before, heard = read_log_trials(folder, STUDY.file), []
     for session in ("1", "2"):
         write(folder, "test", "optimisation", session, dry_run=True)
-    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY, note=heard.append), before)
+    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY.file, note=heard.append), before)
     assert heard[0] == f"{folder}: 2 dry runs are left out." and len(heard) == 2  # the other is of who validated
-    assert {state.header.participant for state in read_sessions(folder, STUDY)} == {"P01", "P02", "P03"}
+    assert {state.header.participant for state in read_sessions(folder, STUDY.file)} == {"P01", "P02", "P03"}
     write(tmp_path / "dry", "test", "optimisation", "1", dry_run=True)
     with pytest.raises(InputError, match="holds nothing but dry runs"):
-        read_sessions(tmp_path / "dry", STUDY)
+        read_sessions(tmp_path / "dry", STUDY.file)
 
 
 def test_a_log_that_lacks_its_last_newline_is_whole_and_one_cut_off_is_said(folder):
     heard = []
-    before = read_log_trials(folder, STUDY, note=heard.append)  # P03 has no answer that counts, and that is said
+    before = read_log_trials(folder, STUDY.file, note=heard.append)  # P03 has no answer that counts, and that is said
     path, same = folder / "P01_1.session.jsonl", list(heard)
     heard.clear()
     whole = path.read_bytes()
     path.write_bytes(whole[:-1])
-    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY, note=heard.append), before)
+    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY.file, note=heard.append), before)
     assert heard == same
     heard.clear()
     path.write_bytes(whole[:-9])
-    read_log_trials(folder, STUDY, note=heard.append)
+    read_log_trials(folder, STUDY.file, note=heard.append)
     sentence, _ = heard
     last = len(whole.splitlines())
     assert sentence.startswith(f"{path}:{last}: the last line is cut off, and is left out;")
     heard.clear()
     path.write_bytes(b"")  # a copy onto a full disk
-    assert set(read_log_trials(folder, STUDY, note=heard.append)["participant"]) == {"P02"}
+    assert set(read_log_trials(folder, STUDY.file, note=heard.append)["participant"]) == {"P02"}
     sentence, _ = heard
     assert sentence.startswith(f"{path}: has no whole first line, and is left out;")
 
@@ -255,47 +257,47 @@ def test_two_logs_of_one_session_are_refused_with_both_names(folder):
     copy.write_bytes(path.read_bytes())
     for read in (read_sessions, read_log_trials):
         with pytest.raises(InputError) as refused:
-            read(folder, STUDY)
+            read(folder, STUDY.file)
         text = str(refused.value)
         assert text.startswith(
             f'{folder}: "{copy.name}" and "{path.name}" are both logs of session 1 of participant P01'
         )
     copy.unlink()
     write(folder, "P01", "validation", "2")  # another session of theirs is none
-    assert len(read_sessions(folder, STUDY)) == 4
+    assert len(read_sessions(folder, STUDY.file)) == 4
 
 
 def test_answers_of_hilbo_try_are_marked_and_not_read_beside_others(folder, tmp_path):
     write(folder, "try-1", "optimisation", "1", unblinded="try")
-    table = trials_table(read_sessions(folder, STUDY))
+    table = trials_table(read_sessions(folder, STUDY.file))
     assert set(table.loc[table["unblinded"] == "try", "participant"]) == {"try-1"}
     assert set(table.loc[table["unblinded"].isna(), "participant"]) == {"P01", "P02", "P03"}
     with pytest.raises(InputError, match="is an unblinded answer, as hilbo try gives"):
-        read_log_trials(folder, STUDY)
+        read_log_trials(folder, STUDY.file)
     write(tmp_path / "own", "try-1", "optimisation", "1", unblinded="try")
-    assert set(read_log_trials(tmp_path / "own", STUDY)["participant"]) == {"try-1"}
+    assert set(read_log_trials(tmp_path / "own", STUDY.file)["participant"]) == {"try-1"}
     (folder / "try-1_1.session.jsonl").unlink()
-    assert "unblinded" not in read_log_trials(folder, STUDY)
+    assert "unblinded" not in read_log_trials(folder, STUDY.file)
 
 
 def test_folders_without_answers_are_refused(tmp_path):
     with pytest.raises(InputError, match="holds no session logs"):
-        read_log_trials(tmp_path, STUDY)
+        read_log_trials(tmp_path, STUDY.file)
     driver = Driver()
-    EventLog.create(tmp_path / log_name(driver.header), STUDY, driver.header).close()
+    EventLog.create(tmp_path / log_name(driver.header), STUDY.file, driver.header).close()
     with pytest.raises(InputError, match="hold no answers yet"):
-        read_log_trials(tmp_path, STUDY)
-    assert not netcdf(read_sessions(tmp_path, STUDY), tmp_path / "x.nc", STUDY)
+        read_log_trials(tmp_path, STUDY.file)
+    assert not netcdf(read_sessions(tmp_path, STUDY.file), tmp_path / "x.nc", STUDY.file)
     assert not (tmp_path / "x.nc").exists()
 
 
 def test_one_name_for_two_sets_is_refused(folder):
     import msgspec
 
-    state = read_sessions(folder, STUDY)[2]
+    state = read_sessions(folder, STUDY.file)[2]
     other = msgspec.structs.replace(state.header, sets=state.header.sets | {"D": {"u": 0.5, "v": 0.5}})
     with pytest.raises(InputError, match='the set "D" of participant P03'):
-        sets_table([state, type(state).start(STUDY, other)])
+        sets_table([state, type(state).start(STUDY.file, other)])
 
 
 def test_consent_comes_before_the_first_trial(tmp_path):

@@ -50,7 +50,9 @@ def test_a_fit_counts_in_every_row_and_padding_does_not():
 
 def test_a_live_trial_fits_each_data_set_once():
     """Look-ahead, answer, explanation, slices and trust; from the space-filling trials on, with a repeat and voids."""
-    state = LiveSession.start(STUDY, msgspec.structs.replace(header(), blocks=(Block("optimisation", 6),), sets={}))
+    state = LiveSession.start(
+        STUDY.file, msgspec.structs.replace(header(), blocks=(Block("optimisation", 6),), sets={})
+    )
     with count_fits() as fits:
         chooser = LiveChooser(state)
         maps = Maps(chooser)

@@ -30,7 +30,7 @@ ANSWERS = ("similar", "different", "close", "close", "similar", "close")
 
 def start(**changes):
     head = msgspec.structs.replace(header(), blocks=(Block("optimisation", 6),), sets={}, **changes)
-    return LiveSession.start(STUDY, head)
+    return LiveSession.start(STUDY.file, head)
 
 
 def asked(state, chooser, at=0.0):
@@ -174,7 +174,7 @@ def test_where_every_value_was_asked_the_one_asked_least_comes_and_no_excluded_o
 def test_where_every_rendering_stopped_twice_they_come_in_turn():
     raw = RAW | {"parameters": {"n": {"low": 0.0, "high": 2.0, "integer": True}}}
     study = Study.from_dict(raw)
-    state = LiveSession.start(study, header_for(study, "P01", warm=False))
+    state = LiveSession.start(study.file, header_for(study.file, "P01", warm=False))
     chooser, stopped = LiveChooser(state), []
     while len(stopped) < 12:
         state = asked(state, chooser)
@@ -297,11 +297,11 @@ def test_several_materials_have_studies_of_their_own():
     study = Study.from_dict(raw)
     head = msgspec.structs.replace(
         header(),
-        study=study.hash,
+        study=study.file.hash,
         sets={},
         blocks=tuple(Block("optimisation", 1, material=m) for m in ("soft", "hard")),
     )
-    state = LiveSession.start(study, head)
+    state = LiveSession.start(study.file, head)
     chooser = LiveChooser(state)
     state = asked(state, chooser)
     assert 5.0 <= state.pending.renderings["a"]["u"] <= 6.0
@@ -311,7 +311,9 @@ def test_several_materials_have_studies_of_their_own():
 
 def optimising(study, *materials):
     blocks = tuple(Block("optimisation", 2, material=m) for m in materials)
-    return LiveSession.start(study, msgspec.structs.replace(header(), study=study.hash, sets={}, blocks=blocks))
+    return LiveSession.start(
+        study.file, msgspec.structs.replace(header(), study=study.file.hash, sets={}, blocks=blocks)
+    )
 
 
 def test_materials_have_space_filling_points_of_their_own_that_do_not_depend_on_their_order():
@@ -333,7 +335,7 @@ def test_materials_have_space_filling_points_of_their_own_that_do_not_depend_on_
 
 
 def test_a_log_of_before_goes_on_with_its_points_and_a_second_session_has_others(tmp_path):
-    today = header_for(STUDY, "P01", "2", 0, warm=False)
+    today = header_for(STUDY.file, "P01", "2", 0, warm=False)
     plain = Session.start(STUDY, seed=0)
     first, second = plain.ask(), plain.tell("close").ask()
     LoggedSession.open(tmp_path, STUDY, msgspec.structs.replace(today, schema=1)).close()
@@ -388,11 +390,11 @@ def test_numbers_that_are_none_stay_out_of_a_choice_and_of_the_log(monkeypatch, 
     assert not {"mean", "sd"} & set(choice)
     assert not {"residual", "condition"} & set(choice["certificate"]) and choice["certificate"]["converged"]
     head = start().header
-    with EventLog.create(tmp_path / log_name(head), STUDY, head) as log:
+    with EventLog.create(tmp_path / log_name(head), STUDY.file, head) as log:
         log.append(event)
         alive = log.state
-    header_, events, _ = read_log(tmp_path / log_name(head), STUDY)
-    assert LiveSession.fold(STUDY, header_, events) == alive
+    header_, events, _ = read_log(tmp_path / log_name(head), STUDY.file)
+    assert LiveSession.fold(STUDY.file, header_, events) == alive
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -80,7 +80,7 @@ def copies(folder):
 @pytest.mark.parametrize("seed", range(3))
 def test_everything_acknowledged_is_in_the_copy_and_nothing_more_is_acknowledged(tmp_path, driven, fault, seed):
     path = tmp_path / "logs" / log_name(driven.header)
-    with EventLog.create(path, STUDY, driven.header) as log:
+    with EventLog.create(path, STUDY.file, driven.header) as log:
         at = random.Random(seed).randrange(1, len(driven.events))
         before, _ = acknowledged(log, driven.events[:at])
         fault(path)
@@ -89,7 +89,7 @@ def test_everything_acknowledged_is_in_the_copy_and_nothing_more_is_acknowledged
         (copy,) = copies(path.parent)
         answers = sum(trial.status == "answered" for trial in log.state.trials)
         assert f"The {answers} answers acknowledged so far are in {copy}" in str(error)
-        assert read_log(copy, STUDY)[1] == before and copy.stat().st_mode & 0o777 == 0o600
+        assert read_log(copy, STUDY.file)[1] == before and copy.stat().st_mode & 0o777 == 0o600
         with pytest.raises(LogLostError):
             log.check()
     assert copies(path.parent) == [copy]  # written once
@@ -104,16 +104,16 @@ def test_a_fault_between_the_write_and_the_acknowledgement_is_seen(tmp_path, dri
         if len(log._lines) == 4 and path.exists():
             replaced(path)
 
-    with EventLog.create(path, STUDY, driven.header) as log:
+    with EventLog.create(path, STUDY.file, driven.header) as log:
         monkeypatch.setattr(os, "fsync", fsync)
         done, error = acknowledged(log, driven.events)
     assert len(done) == 3 and "was replaced by another file" in str(error)
-    assert read_log(*copies(tmp_path), STUDY)[1] == done
+    assert read_log(*copies(tmp_path), STUDY.file)[1] == done
 
 
 def test_a_copy_that_cannot_be_written_names_what_is_at_stake_and_is_tried_again(tmp_path, driven):
     path = tmp_path / "logs" / log_name(driven.header)
-    with EventLog.create(path, STUDY, driven.header) as log:
+    with EventLog.create(path, STUDY.file, driven.header) as log:
         done, _ = acknowledged(log, driven.events[:-1])
         folder_renamed(path)
         path.parent.write_text("in the way of the folder")
@@ -124,24 +124,24 @@ def test_a_copy_that_cannot_be_written_names_what_is_at_stake_and_is_tried_again
         path.parent.unlink()
         with pytest.raises(LogLostError, match=r"acknowledged so far are in .*rescued\.jsonl"):
             log.check()
-    assert read_log(*copies(path.parent), STUDY)[1] == done
+    assert read_log(*copies(path.parent), STUDY.file)[1] == done
 
 
 def test_a_second_server_resumes_a_copied_log_and_the_first_stops(tmp_path, driven):
     path = tmp_path / log_name(driven.header)
-    with EventLog.create(path, STUDY, driven.header) as first:
+    with EventLog.create(path, STUDY.file, driven.header) as first:
         acknowledged(first, driven.events[:-1])
         moved_and_copied_back(path)
-        with EventLog.resume(path, STUDY) as second:
+        with EventLog.resume(path, STUDY.file) as second:
             second.append(driven.events[-1])
             with pytest.raises(LogLostError):
                 first.append(driven.events[-1])
-    assert read_log(path, STUDY)[1] == driven.events
+    assert read_log(path, STUDY.file)[1] == driven.events
 
 
 def test_logs_under_other_names_are_named_and_files_of_macos_are_not_read(tmp_path, driven):
     path = tmp_path / log_name(driven.header)
-    with EventLog.create(path, STUDY, driven.header) as log:
+    with EventLog.create(path, STUDY.file, driven.header) as log:
         acknowledged(log, driven.events)
         deleted(path)
         with pytest.raises(LogLostError):
@@ -158,9 +158,9 @@ def test_logs_under_other_names_are_named_and_files_of_macos_are_not_read(tmp_pa
     )
     assert sum("under another name" in sentence for sentence in said) == 2
     said.clear()
-    assert len(read_sessions(tmp_path, STUDY, said.append)) == 1 and len(said) == 3
+    assert len(read_sessions(tmp_path, STUDY.file, said.append)) == 1 and len(said) == 3
 
 
 def test_a_folder_that_is_not_there_holds_no_logs(tmp_path):
     with pytest.raises(InputError, match="holds no session logs"):
-        read_sessions(tmp_path / "nowhere", STUDY)
+        read_sessions(tmp_path / "nowhere", STUDY.file)

@@ -29,11 +29,11 @@ MATERIALS = Study.from_dict(RAW | {"materials": {"foam": {}, "soft": {}, "hard":
 
 
 def test_a_plan_is_reproduced_from_its_seed_and_survives_json():
-    plan = make_plan(STUDY, PEOPLE, 3)
-    assert plan == make_plan(STUDY, PEOPLE, 3) != make_plan(STUDY, PEOPLE, 4)
+    plan = make_plan(STUDY.file, PEOPLE, 3)
+    assert plan == make_plan(STUDY.file, PEOPLE, 3) != make_plan(STUDY.file, PEOPLE, 4)
     again = json.loads(json.dumps(plan))
     assert plan_hash(again) == plan["hash"]
-    header = planned_header(again, STUDY, "P03")
+    header = planned_header(again, STUDY.file, "P03")
     assert header.plan == plan["hash"] and header.participant == "P03"
     assert [block.phase for block in header.blocks] == ["warm-up", "optimisation"]
     seeds = [row["header"]["seed"] for row in plan["participants"]]
@@ -41,57 +41,57 @@ def test_a_plan_is_reproduced_from_its_seed_and_survives_json():
 
 
 def test_a_changed_plan_another_study_and_strangers_are_refused():
-    plan = make_plan(STUDY, PEOPLE, 3)
+    plan = make_plan(STUDY.file, PEOPLE, 3)
     changed = json.loads(json.dumps(plan))
     changed["participants"][0]["header"]["seed"] += 1
     with pytest.raises(InputError, match="was changed after it was made"):
-        planned_header(changed, STUDY, "P01")
+        planned_header(changed, STUDY.file, "P01")
     with pytest.raises(InputError, match="belongs to another study"):
-        planned_header(plan, MATERIALS, "P01")
+        planned_header(plan, MATERIALS.file, "P01")
     with pytest.raises(InputError, match='participant "P99" is not in the plan'):
-        planned_header(plan, STUDY, "P99")
+        planned_header(plan, STUDY.file, "P99")
     with pytest.raises(InputError, match="is no plan"):
-        planned_header({}, STUDY, "P01")
+        planned_header({}, STUDY.file, "P01")
     with pytest.raises(InputError, match="each once"):
-        make_plan(STUDY, ["P01", "P01"])
+        make_plan(STUDY.file, ["P01", "P01"])
     for label in ("x" * 65, "a\nb", ""):
         with pytest.raises(InputError, match="label"):
-            make_plan(STUDY, ["P01"], session=label)
-    assert planned_header(make_plan(STUDY, ["P01"], session="x" * 64), STUDY, "P01").session == "x" * 64
+            make_plan(STUDY.file, ["P01"], session=label)
+    assert planned_header(make_plan(STUDY.file, ["P01"], session="x" * 64), STUDY.file, "P01").session == "x" * 64
 
 
 def test_three_materials_come_in_all_orders():
-    plan = make_plan(MATERIALS, [f"P{i}" for i in range(12)], 0)
+    plan = make_plan(MATERIALS.file, [f"P{i}" for i in range(12)], 0)
     assert plan["complete"] and plan["complete_at"] == "multiples of 6 participants"
     seen = Counter(
         tuple(b["material"] for b in row["header"]["blocks"] if b["phase"] == "optimisation")
         for row in plan["participants"]
     )
     assert len(seen) == 6 and set(seen.values()) == {2}
-    assert not make_plan(MATERIALS, [f"P{i}" for i in range(8)], 0)["complete"]
+    assert not make_plan(MATERIALS.file, [f"P{i}" for i in range(8)], 0)["complete"]
 
 
 def test_validation_shows_each_pair_four_times_and_each_set_eight():
-    plan = make_plan(STUDY, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate")
+    plan = make_plan(STUDY.file, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate")
     for person in PEOPLE:
-        header = planned_header(plan, STUDY, person)
+        header = planned_header(plan, STUDY.file, person)
         trials = header.blocks[1].trials
         assert len(trials) == header.blocks[1].count == 12
         assert Counter(name for t in trials for name in (t.a, t.b)) == dict.fromkeys(SETS, 8)
         assert set(Counter(frozenset((t.a, t.b)) for t in trials).values()) == {4}
         assert Counter(t.first for t in trials) == {"a": 6, "b": 6}
-    orders = {planned_header(plan, STUDY, person).blocks[1].trials for person in PEOPLE}
+    orders = {planned_header(plan, STUDY.file, person).blocks[1].trials for person in PEOPLE}
     assert len(orders) > 1
     with pytest.raises(InputError, match="give --from"):
-        make_plan(STUDY, PEOPLE, 0, "validation")
+        make_plan(STUDY.file, PEOPLE, 0, "validation")
     with pytest.raises(InputError, match="no map of their own"):
-        make_plan(STUDY, PEOPLE, 0, "validation", sets={"": SETS}, source="individual")
+        make_plan(STUDY.file, PEOPLE, 0, "validation", sets={"": SETS}, source="individual")
 
 
 def test_individual_sets_are_shown_to_their_owner_only():
     sets = {f"{person} {name}": values for person in PEOPLE for name, values in SETS.items()}
-    plan = make_plan(STUDY, PEOPLE, 0, "validation", sets={"": sets}, source="individual")
-    header = planned_header(plan, STUDY, "P02")
+    plan = make_plan(STUDY.file, PEOPLE, 0, "validation", sets={"": sets}, source="individual")
+    header = planned_header(plan, STUDY.file, "P02")
     own = [name.split(" ") for name in header.sets if not name.startswith("warm-up")]
     assert sorted(role for _, role in own) == sorted(SETS) and len({code for code, _ in own}) == 1
     assert not any("P02" in name for name in header.sets)
@@ -101,8 +101,8 @@ def test_individual_sets_are_shown_to_their_owner_only():
 
 def test_aggregate_best_of_three_materials_rests_between_them():
     own = {"aggregate": SETS["best"]} | {f"individual:P{i}": {"u": 0.01 * i, "v": 0.5} for i in range(24)}
-    plan = make_plan(MATERIALS, PEOPLE[:6], 0, "aggregate-best", sets=dict.fromkeys(MATERIALS.materials, own))
-    header = planned_header(plan, MATERIALS, "P01")
+    plan = make_plan(MATERIALS.file, PEOPLE[:6], 0, "aggregate-best", sets=dict.fromkeys(MATERIALS.file.materials, own))
+    header = planned_header(plan, MATERIALS.file, "P01")
     assert [block.phase for block in header.blocks] == ["warm-up", *["aggregate-best"] * 3]
     assert [block.rest for block in header.blocks] == [0, 0, 600, 600]
     assert {block.count for block in header.blocks[1:]} == {48}
@@ -113,9 +113,9 @@ def test_aggregate_best_of_three_materials_rests_between_them():
 def test_a_plan_calls_nobodys_sets_by_their_id():
     own = {f"individual:P{i:02d}": {"u": 0.04 * i, "v": 0.5} for i in range(1, 25)}
     sets = {"": {"aggregate": SETS["best"]} | own}
-    plan = make_plan(STUDY, ["J01", "J02"], 0, "aggregate-best", sets=sets)
-    assert plan == make_plan(STUDY, ["J01", "J02"], 0, "aggregate-best", sets=sets)
-    header = planned_header(plan, STUDY, "J01")
+    plan = make_plan(STUDY.file, ["J01", "J02"], 0, "aggregate-best", sets=sets)
+    assert plan == make_plan(STUDY.file, ["J01", "J02"], 0, "aggregate-best", sets=sets)
+    header = planned_header(plan, STUDY.file, "J01")
     named = [name for name in header.sets if name.startswith("individual:")]
     assert len(named) == 24 and not any(person in json.dumps(plan) for person in own)
     order = [header.sets[name]["u"] for name in named]
@@ -142,7 +142,7 @@ FORGED_PLANS = {
 
 @pytest.mark.parametrize("words", FORGED_PLANS)
 def test_a_plan_whose_hash_fits_and_says_what_cannot_be_is_refused(words):
-    plan = json.loads(json.dumps(make_plan(STUDY, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate")))
+    plan = json.loads(json.dumps(make_plan(STUDY.file, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate")))
     (*way, last), value = FORGED_PLANS[words]
     place = plan
     for key in way:
@@ -150,13 +150,13 @@ def test_a_plan_whose_hash_fits_and_says_what_cannot_be_is_refused(words):
     place[last] = value
     plan["hash"] = plan_hash(plan)
     with pytest.raises(InputError):
-        planned_header(plan, STUDY, "P01")
+        planned_header(plan, STUDY.file, "P01")
 
 
 def test_a_row_is_reissued_with_its_order_and_seed():
-    plan = make_plan(MATERIALS, PEOPLE, 0)
+    plan = make_plan(MATERIALS.file, PEOPLE, 0)
     changed = reissue(plan, "P03", "P30")
-    old, new = (planned_header(changed, MATERIALS, person) for person in ("P03", "P30"))
+    old, new = (planned_header(changed, MATERIALS.file, person) for person in ("P03", "P30"))
     assert new == msgspec.structs.replace(old, participant="P30") and changed["hash"] != plan["hash"]
     assert changed["replaces"] == [plan["hash"]]
     with pytest.raises(InputError, match="must be in the plan"):
@@ -165,7 +165,7 @@ def test_a_row_is_reissued_with_its_order_and_seed():
 
 def choosing(label, *materials, **changes):
     """Material -> the seed of what a session of the seed 7 chooses with it."""
-    head = header_for(STUDY, "P01", label, 7, warm=False)
+    head = header_for(STUDY.file, "P01", label, 7, warm=False)
     blocks = tuple(Block("optimisation", 2, material=name) for name in materials)
     head = msgspec.structs.replace(head, blocks=blocks, **changes)
     return {name: material_seed(head, name) for name in materials}
@@ -176,8 +176,8 @@ def test_nobody_meets_the_points_of_an_earlier_session_or_of_another_material():
     seeds = [choosing(label, material)[material] for label in labels for material in materials]
     assert len(set(seeds)) == len(seeds) and choosing("1", None) == {None: 7}
     assert choosing("2", "red", "blue") == choosing("2", "blue", "red") == choosing("2", "red") | choosing("2", "blue")
-    plan = make_plan(STUDY, ["P01"])
-    assert planned_header(plan, STUDY, "P01").schema == header_for(STUDY, "P01", warm=False).schema == 3
+    plan = make_plan(STUDY.file, ["P01"])
+    assert planned_header(plan, STUDY.file, "P01").schema == header_for(STUDY.file, "P01", warm=False).schema == 3
 
 
 def test_sessions_of_schema_1_keep_their_seeds():
@@ -189,8 +189,10 @@ def test_sessions_of_schema_1_keep_their_seeds():
 
 def test_warm_up_renderings_are_feasible_spread_and_seeded():
     study = Study.load("hilbo/data/paper.toml")
-    block, sets = warm_up(study, 5)
-    assert block.count == 12 and len(block.trials) == 24 and warm_up(study, 5)[1] == sets != warm_up(study, 6)[1]
+    block, sets = warm_up(study.file, 5)
+    assert (
+        block.count == 12 and len(block.trials) == 24 and warm_up(study.file, 5)[1] == sets != warm_up(study.file, 6)[1]
+    )
     physical = np.array([list(values.values()) for values in sets.values()])
     unit = np.asarray(study.space.to_unit(physical))
     assert bool(np.all(study.space.feasible(unit)))
@@ -202,13 +204,15 @@ def test_a_warm_up_keeps_the_constraints():
     bound = {"terms": {"u": 1.0, "v": 1.0}, "most": 0.8}
     study = Study.from_dict(RAW | {"constraints": [bound]})
     for seed in range(4):
-        sets = warm_up(study, seed)[1]
+        sets = warm_up(study.file, seed)[1]
         assert sets and all(values["u"] + values["v"] <= 0.8 for values in sets.values())
 
 
 def test_a_planned_validation_session_runs_blind():
-    head = planned_header(make_plan(STUDY, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate"), STUDY, "P01")
-    state = LiveSession.start(STUDY, head)
+    head = planned_header(
+        make_plan(STUDY.file, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate"), STUDY.file, "P01"
+    )
+    state = LiveSession.start(STUDY.file, head)
     chooser, seen = LiveChooser(state), []
     while state.screen != "done":
         if state.screen == "ready":
@@ -216,7 +220,7 @@ def test_a_planned_validation_session_runs_blind():
             continue
         state = state.after(live.propose(state, chooser, 0.0))
         seen.append(json.dumps(participant_view(state)))
-        asks = protocol(STUDY.session, state.header.blocks[state.pending.block].phase).asks
+        asks = protocol(STUDY.file.session, state.header.blocks[state.pending.block].phase).asks
         values = {ask: "a" if ask == "preferred" else "close" for ask in asks}
         state = state.after(live.answer(state, state.pending.id, "c", values, 1.0, felt=False))
     assert len(seen) == 24 and chooser.fits == 0
@@ -226,7 +230,7 @@ def test_a_planned_validation_session_runs_blind():
 
 def result():
     people = [{"participant": f"P0{i}", "optimum": {"parameters": SETS["mid"]}} for i in (1, 2)]
-    return {"study": STUDY.hash, "seed": 0, "optimum": {"parameters": SETS["best"]}, "participants": people}
+    return {"study": STUDY.file.hash, "seed": 0, "optimum": {"parameters": SETS["best"]}, "participants": people}
 
 
 def test_results_are_checked(tmp_path):
@@ -258,13 +262,16 @@ def test_a_study_changes_protocols_and_texts():
         }
     }
     study = Study.from_dict(raw)
-    assert study.hash != STUDY.hash and study.session.text("question") == "Wie ähnlich?"
-    assert protocol(study.session, "optimisation").seconds == 3 and protocol(study.session, "aggregate-best").count == 3
-    assert study.session.label("close") == "Nah" and study.session.label("similar") == "Similar"
-    assert "highly close" in study.session.definition("close")
-    paper = protocol(STUDY.session, "validation")
+    assert study.file.hash != STUDY.file.hash and study.file.session.text("question") == "Wie ähnlich?"
+    assert (
+        protocol(study.file.session, "optimisation").seconds == 3
+        and protocol(study.file.session, "aggregate-best").count == 3
+    )
+    assert study.file.session.label("close") == "Nah" and study.file.session.label("similar") == "Similar"
+    assert "highly close" in study.file.session.definition("close")
+    paper = protocol(STUDY.file.session, "validation")
     assert sum(step.seconds for step in paper.steps if step.show != "neutral") == 12
-    assert protocol(STUDY.session, "optimisation").seconds == 8
+    assert protocol(STUDY.file.session, "optimisation").seconds == 8
 
 
 @pytest.mark.parametrize(
@@ -289,19 +296,19 @@ def test_a_wrong_session_table_is_one_sentence(session, sentence):
 
 
 def test_people_planned_in_two_batches_share_no_seed():
-    one, other = (make_plan(STUDY, people, seed=3)["participants"] for people in (["A1", "A2"], ["B1", "B2"]))
+    one, other = (make_plan(STUDY.file, people, seed=3)["participants"] for people in (["A1", "A2"], ["B1", "B2"]))
     assert len({row["header"]["seed"] for row in [*one, *other]}) == 4
-    longer = make_plan(STUDY, ["A1", "A2", "A3"], seed=3)["participants"]
+    longer = make_plan(STUDY.file, ["A1", "A2", "A3"], seed=3)["participants"]
     assert [row["header"]["seed"] for row in longer[:2]] == [row["header"]["seed"] for row in one]
 
 
 def test_ids_that_differ_in_capitals_only_are_refused():
     with pytest.raises(InputError, match='participants "P01" and "p01" differ in capitals only'):
-        make_plan(STUDY, ["P01", "P02", "p01"])
+        make_plan(STUDY.file, ["P01", "P02", "p01"])
 
 
 def test_a_result_by_another_rule_is_told_apart_from_other_trials():
-    result = Result(STUDY.hash, FoundOptimum({}), (FoundPerson("P01"),), rule="average")
+    result = Result(STUDY.file.hash, FoundOptimum({}), (FoundPerson("P01"),), rule="average")
     answers = pd.DataFrame({"participant": "P01", "trial": [1], "response": "close", "u": 0.5, "v": 0.5})
     cohort = cohort_of(answers, STUDY)
     with pytest.raises(InputError, match=r'is by the rule "average", and the study\'s is "bcm"'):

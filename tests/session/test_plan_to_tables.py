@@ -36,7 +36,7 @@ def sets_for(source):
 
 def answered(header, rng):
     """The events of a session in which the better set is mostly classified and preferred as such."""
-    state = LiveSession.start(STUDY, header)
+    state = LiveSession.start(STUDY.file, header)
     while state.screen != "done":
         if state.screen in ("ready", "rest"):
             event = live.go_on(state, 1.0)
@@ -65,7 +65,7 @@ def values_of(trial, rng):
 
 def logged(folder, phase, source):
     plan = make_plan(
-        STUDY,
+        STUDY.file,
         PEOPLE,
         3,
         phase,
@@ -75,8 +75,8 @@ def logged(folder, phase, source):
     )
     rng = np.random.default_rng(11)
     for person in PEOPLE:
-        header = planned_header(plan, STUDY, person)
-        with EventLog.create(folder / log_name(header), STUDY, header) as log:
+        header = planned_header(plan, STUDY.file, person)
+        with EventLog.create(folder / log_name(header), STUDY.file, header) as log:
             for event in answered(header, rng):
                 log.append(event)
 
@@ -87,7 +87,7 @@ def tables(tmp_path_factory, monkeypatch_module, request):
     folder = tmp_path_factory.mktemp(request.param)
     logged(folder, "validation", request.param)
     logged(folder, "aggregate-best", "best")
-    psych_ds(read_sessions(folder, STUDY), folder / "out", STUDY)
+    psych_ds(read_sessions(folder, STUDY.file), folder / "out", STUDY.file)
     return folder / "out" / "data"
 
 
@@ -135,8 +135,8 @@ def test_sets_of_a_renderer_have_all_that_a_device_needs():
     mechanics = study.space.mechanics
     sets = {n: {"K1": 2.0, "B1": b, "alpha": 0.2} for n, b in (("best", 1.0), ("mid", 2.0))}
     block = Block("validation", 1, (Planned("best", "mid"),))
-    header = Header(study=study.hash, participant="P01", session="1", seed=0, blocks=(block,), sets=sets)
-    row = sets_table([LiveSession.start(study, header)]).set_index("set_id").loc["best"]
+    header = Header(study=study.file.hash, participant="P01", session="1", seed=0, blocks=(block,), sets=sets)
+    row = sets_table([LiveSession.start(study.file, header)]).set_index("set_id").loc["best"]
     assert row[["N", "T", "memory", "role"]].tolist() == [mechanics.N, float(mechanics.T), mechanics.memory, "best"]
     assert "material" not in row
     assert ("states" in row) == (mechanics.memory == "full")

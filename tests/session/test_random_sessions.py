@@ -38,7 +38,7 @@ KINDS = ("optimisation", "three materials", "validation", "own maps", "aggregate
 def header_of(kind, person):
     """The header of a planned session."""
     if kind == "no warm-up":
-        return header_for(STUDY, person, materials=("foam",), warm=False)
+        return header_for(STUDY.file, person, materials=("foam",), warm=False)
     materials = (
         ("soft",) if kind in ("optimisation", "own maps") else MATERIALS[: 3 if kind == "three materials" else 2]
     )
@@ -47,8 +47,8 @@ def header_of(kind, person):
     names += ["aggregate", "individual:P8", "individual:P9"]
     sets = {m: {n: {"u": i / 40, "v": j / 4} for i, n in enumerate(names)} for j, m in enumerate(materials)}
     source = "individual" if kind == "own maps" else "aggregate"
-    plan = make_plan(STUDY, PEOPLE, 5, phase, materials=materials, sets=sets, source=source)
-    return planned_header(plan, STUDY, person)
+    plan = make_plan(STUDY.file, PEOPLE, 5, phase, materials=materials, sets=sets, source=source)
+    return planned_header(plan, STUDY.file, person)
 
 
 class Drawing:
@@ -80,7 +80,7 @@ class Lab:
 
     def __init__(self, kind, rng):
         self.rng, self.header = rng, header_of(kind, PEOPLE[rng.integers(3)])
-        self.state, self.events, self.clock = LiveSession.start(STUDY, self.header), [], 0.0
+        self.state, self.events, self.clock = LiveSession.start(STUDY.file, self.header), [], 0.0
         self.stops, self.wished = Counter(), Counter()
         self.left_out = set()  # trials that a person left out
         self.stubborn = 1 if rng.random() < 0.2 else None
@@ -131,7 +131,7 @@ class Lab:
         trial = self.state.pending
         if trial is None:
             return
-        asks = live.protocol(STUDY.session, self.header.blocks[trial.block].phase).asks
+        asks = live.protocol(STUDY.file.session, self.header.blocks[trial.block].phase).asks
         values = {ask: "a" if ask == "preferred" else STUDY.responses[self.rng.integers(3)] for ask in asks}
         client = f"c{len(self.events)}"
         self.log(live.answer(self.state, trial.id, client, values, self.clock, felt=whole))
@@ -209,7 +209,7 @@ class Lab:
 
     def killed(self):
         """The server is killed, and goes on from the log: with the same trial."""
-        resumed = LiveSession.fold(STUDY, self.header, self.events)
+        resumed = LiveSession.fold(STUDY.file, self.header, self.events)
         assert resumed == self.state
         self.state = resumed
 
@@ -232,7 +232,7 @@ class Lab:
 
     def check(self):
         state = self.state
-        assert LiveSession.fold(STUDY, self.header, self.events) == state
+        assert LiveSession.fold(STUDY.file, self.header, self.events) == state
         for number, block in enumerate(self.header.blocks):
             answers, skipped = state.answers(number), state.skipped(number)
             known = {key: count for (where, key), count in self.stops.items() if where == number}

@@ -21,7 +21,7 @@ def write(path, kind):
     doings = ("feel", "answer", "answer", "go", "answer", "hold", "undo", "void", "again", "pause", "resume", "note")
     for number, doing in enumerate(doings):
         driver.do(doing, number)
-    with EventLog.create(path, STUDY, driver.header) as log:
+    with EventLog.create(path, STUDY.file, driver.header) as log:
         for event in driver.events:
             log.append(event)
     return [json.loads(line) for line in path.read_bytes().splitlines()]
@@ -111,11 +111,11 @@ def test_a_log_that_fits_and_says_what_cannot_be_is_refused(tmp_path, words):
     path = tmp_path / "P01_1.session.jsonl"
     lines = write(path, "optimisation")
     chained(path, lines)
-    EventLog.resume(path, STUDY).close()  # as it was, it is a good log
+    EventLog.resume(path, STUDY.file).close()  # as it was, it is a good log
     FORGED[words](lines)
     chained(path, lines)
     content = path.read_bytes()
-    for read in (lambda: EventLog.resume(path, STUDY), lambda: read_sessions(tmp_path, STUDY)):
+    for read in (lambda: EventLog.resume(path, STUDY.file), lambda: read_sessions(tmp_path, STUDY.file)):
         with pytest.raises(InputError, match=r"P01_1\.session\.jsonl"):
             read()
     assert path.read_bytes() == content
@@ -126,7 +126,7 @@ def test_a_line_that_is_no_event_is_refused(tmp_path, text):
     path = tmp_path / "P01_1.session.jsonl"
     path.write_bytes(text + b',"crc":"%08x"}\n' % zlib.crc32(text))
     with pytest.raises(InputError, match=":1: "):
-        EventLog.resume(path, STUDY)
+        EventLog.resume(path, STUDY.file)
 
 
 def test_a_log_is_its_owners_alone(tmp_path):
@@ -148,14 +148,14 @@ def test_words_and_ids_of_earlier_versions_make_no_log_unreadable(tmp_path, pers
     older_words(lines)
     lines[0]["data"]["participant"] = person
     chained(path, lines)
-    EventLog.resume(path, STUDY).close()
-    sessions = read_sessions(tmp_path, STUDY)
-    exported = psych_ds(sessions, tmp_path / "tables", STUDY)
+    EventLog.resume(path, STUDY.file).close()
+    sessions = read_sessions(tmp_path, STUDY.file)
+    exported = psych_ds(sessions, tmp_path / "tables", STUDY.file)
     table = next(file for file in exported if file.name == "study-plain_table-presentations_data.csv").read_text()
     assert "sneezed" not in table and table.count("see the log") == 1
     header = msgspec.structs.replace(sessions[0].header, session="2")
     with pytest.raises(InputError, match="participant is"):
-        EventLog.create(tmp_path / "new.session.jsonl", STUDY, header)
+        EventLog.create(tmp_path / "new.session.jsonl", STUDY.file, header)
 
 
 def test_an_export_names_the_log_whose_label_a_spreadsheet_would_run(tmp_path):
@@ -164,4 +164,4 @@ def test_an_export_names_the_log_whose_label_a_spreadsheet_would_run(tmp_path):
     lines[0]["data"]["session"] = "=1+1"
     chained(path, lines)
     with pytest.raises(InputError, match=r"P01_-1-1\.session\.jsonl: the session's label"):
-        psych_ds(read_sessions(tmp_path, STUDY), tmp_path / "tables", STUDY)
+        psych_ds(read_sessions(tmp_path, STUDY.file), tmp_path / "tables", STUDY.file)

@@ -18,7 +18,7 @@ deep = pytest.mark.deep
 
 
 def load(file, inference):
-    raw = json.loads(Study.load(file).content) | {"schema": 1}
+    raw = json.loads(Study.load(file).file.content) | {"schema": 1}
     return Study.from_dict(raw | {"gp": raw["gp"] | {"inference": inference}})
 
 
@@ -70,6 +70,6 @@ def test_the_next_point_is_the_best_by_the_sessions_own_posterior(inference):
     posterior = session.posterior()
     assert posterior.certificate.converged
     x = study.space.to_unit(np.array(list(session.ask().values())))[None, :]
-    score = UCB(study.selection.weight)
+    score = UCB(study.file.selection.weight)
     others = search_points(study.space, 8)  # points that the session has not looked at
     assert score(*posterior.predict(x))[0] >= jnp.max(score(*posterior.predict(others))) - 1e-6

@@ -20,9 +20,9 @@ from hilbo.session.plan.plan import make_plan, plan_hash, planned_header, reissu
 from hilbo.session.withdrawal import withdrawal
 from hilbo.session.withdrawal.results import command_without
 from hilbo.session.withdrawal.withdrawal import delete_participant
+from hilbo.study.cohort import read_trials
 from hilbo.study.disk.lock import locked_folder
 from hilbo.study.results.listing import list_files, listed
-from hilbo.study.tables.trials import read_trials
 from hilbo.study.tables.validation import read_validation, sets_frame
 
 SETS = {"best": {"u": 0.5, "v": 0.5}, "own-P02": {"u": 0.1, "v": 0.5}, "own-P01": {"u": 0.2, "v": 0.5}}
@@ -43,7 +43,7 @@ def folder(tmp_path):
     compared = [(p, 1, "best", "own-P02", "", "", "own-P02") for p in ("P02", "P03")]
     columns = ["participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred"]
     pd.DataFrame(compared, columns=columns).to_csv(tmp_path / "validation.csv", index=False)
-    (tmp_path / "plan.json").write_text(json.dumps(make_plan(STUDY, ["P01", "P02", "P03"], 0)))
+    (tmp_path / "plan.json").write_text(json.dumps(make_plan(STUDY.file, ["P01", "P02", "P03"], 0)))
     return tmp_path
 
 
@@ -101,12 +101,12 @@ def test_a_plan_keeps_its_order_and_says_which_it_replaces(folder, capsys, monke
     delete(capsys, monkeypatch, folder, "P02")
     after = json.loads((folder / "plan.json").read_text())
     assert after["replaces"] == [before["hash"]] != [after["hash"]]
-    assert planned_header(after, STUDY, "P03").seed == planned_header(before, STUDY, "P03").seed
+    assert planned_header(after, STUDY.file, "P03").seed == planned_header(before, STUDY.file, "P03").seed
     label = after["participants"][1]["participant"]
     fresh = reissue(after, label, "P30")
-    assert planned_header(fresh, STUDY, "P30").seed == planned_header(before, STUDY, "P02").seed
+    assert planned_header(fresh, STUDY.file, "P30").seed == planned_header(before, STUDY.file, "P02").seed
     with pytest.raises(InputError, match="not in the plan"):
-        planned_header(after, STUDY, "P02")
+        planned_header(after, STUDY.file, "P02")
 
 
 def results_of(monkeypatch, folder, people, *command):
@@ -156,13 +156,13 @@ def older_log(folder, person):
     """The log of somebody who compared a set that is called after P02."""
     block = Block("aggregate-best", 1, (Planned("aggregate", "individual:P02"),))
     sets = {"aggregate": SETS["best"], "individual:P02": SETS["own-P02"]}
-    header = Header(study=STUDY.hash, participant=person, session="3", seed=0, blocks=(block,), sets=sets)
+    header = Header(study=STUDY.file.hash, participant=person, session="3", seed=0, blocks=(block,), sets=sets)
     driver = Driver()
-    driver.header, driver.state = header, type(driver.state).start(STUDY, header)
+    driver.header, driver.state = header, type(driver.state).start(STUDY.file, header)
     driver.values = lambda trial, number: {"preferred": "a"}
     driver.step()
     driver.finish()
-    with EventLog.create(folder / log_name(header), STUDY, header) as log:
+    with EventLog.create(folder / log_name(header), STUDY.file, header) as log:
         for event in driver.events:
             log.append(event)
     return folder / log_name(header)
@@ -197,15 +197,15 @@ def test_logs_of_others_are_listed_and_stay_as_they_are(folder, capsys, monkeypa
 
 def test_a_plan_of_today_leaves_no_id_with_others():
     own = {f"individual:P0{i}": {"u": 0.1 * i, "v": 0.5} for i in (1, 2, 3)}
-    plan = make_plan(STUDY, ["J01"], 0, "aggregate-best", sets={"": {"aggregate": SETS["best"]} | own})
-    header = planned_header(plan, STUDY, "J01")
+    plan = make_plan(STUDY.file, ["J01"], 0, "aggregate-best", sets={"": {"aggregate": SETS["best"]} | own})
+    header = planned_header(plan, STUDY.file, "J01")
     assert "P02" not in json.dumps([header.sets, [[t.a, t.b] for b in header.blocks for t in b.trials]])
     own_u = sorted(values["u"] for name, values in header.sets.items() if name.startswith("individual:"))
     np.testing.assert_allclose(own_u, [0.1, 0.2, 0.3])
 
 
 def test_an_id_that_is_a_number_changes_names_alone(tmp_path):
-    plan = json.loads(json.dumps(make_plan(STUDY, ["1", "2", "3"], 0)))
+    plan = json.loads(json.dumps(make_plan(STUDY.file, ["1", "2", "3"], 0)))
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     done = delete_participant(tmp_path, "1")
     after = json.loads((tmp_path / "plan.json").read_text())
@@ -213,7 +213,7 @@ def test_an_id_that_is_a_number_changes_names_alone(tmp_path):
         assert row == was
     first, was = after["participants"][0]["header"], plan["participants"][0]["header"]
     assert first == was | {"participant": done.label}
-    assert planned_header(after, STUDY, "2").session == "1"
+    assert planned_header(after, STUDY.file, "2").session == "1"
 
 
 def test_names_of_sets_in_a_plan_change_with_the_trials_that_show_them(tmp_path):
@@ -221,12 +221,12 @@ def test_names_of_sets_in_a_plan_change_with_the_trials_that_show_them(tmp_path)
     sets = {"aggregate": SETS["best"], "individual:P02": SETS["own-P02"], "individual:P020": SETS["own-P01"]}
     rows = []
     for order, person in enumerate(["P01", "P02"]):
-        header = Header(study=STUDY.hash, participant=person, session="3", seed=order, blocks=(block,), sets=sets)
+        header = Header(study=STUDY.file.hash, participant=person, session="3", seed=order, blocks=(block,), sets=sets)
         rows.append({"participant": person, "order": order, "header": msgspec.to_builtins(header)})
-    plan = {"schema": 1, "study": STUDY.hash, "phase": "aggregate-best", "source": None, "participants": rows}
+    plan = {"schema": 1, "study": STUDY.file.hash, "phase": "aggregate-best", "source": None, "participants": rows}
     (tmp_path / "plan.json").write_text(json.dumps(plan | {"hash": plan_hash(plan)}))
     done = delete_participant(tmp_path, "P02")
-    header = planned_header(json.loads((tmp_path / "plan.json").read_text()), STUDY, "P01")
+    header = planned_header(json.loads((tmp_path / "plan.json").read_text()), STUDY.file, "P01")
     assert list(header.sets) == ["aggregate", f"individual:{done.label}", "individual:P020"]
 
 
@@ -328,12 +328,12 @@ def test_a_number_is_an_id_where_ids_stand_alone(tmp_path):
     (tmp_path / "t.csv").write_text("participant,trial,u\n1,1,1\n2,1,1\n")
     (tmp_path / "device.csv").write_text("time,force\n1,1\n")
     (tmp_path / "subjects.csv").write_text("subject;age\n1;30\n")
-    (tmp_path / "plan.json").write_text(json.dumps(make_plan(STUDY, ["2", "3"], 0)))
+    (tmp_path / "plan.json").write_text(json.dumps(make_plan(STUDY.file, ["2", "3"], 0)))
     (tmp_path / "notes.md").write_text("1 of 2 motors was warm.")
     (tmp_path / "diary.md").write_text("Participant 1 came late.")
     driver = Driver()
     driver.step()
-    with EventLog.create(tmp_path / "P01_1.session.jsonl", STUDY, driver.header) as log:
+    with EventLog.create(tmp_path / "P01_1.session.jsonl", STUDY.file, driver.header) as log:
         log.append(driver.events[0])
     left = delete_participant(tmp_path, "1").left
     assert {Path(name).name for name in left} == {"subjects.csv", "diary.md"}

@@ -110,7 +110,7 @@ def test_the_surest_share_is_the_exact_bound():
 @pytest.mark.parametrize("rule", ["average", "learnt-2"])
 def test_a_rule_in_place_of_the_files_stays_with_other_numbers_of_trials(rule):
     shorter = _with_trials(by_rule(study(), rule), 7)
-    assert (shorter.rule, shorter.selection.trials) == (rule, 7)
+    assert (shorter.rule, shorter.file.selection.trials) == (rule, 7)
 
 
 def test_one_person_cannot_differ():

@@ -129,7 +129,7 @@ def test_people_who_like_nothing_that_may_be_rendered_are_refused():
 
 def test_people_of_simulations_are_not_part_of_the_hash():
     plain, stated = (Study.from_dict(tomllib.loads(text)) for text in (VISUAL, VISUAL + STATED))
-    assert plain.hash == stated.hash and stated.simulation is not None
+    assert plain.file.hash == stated.file.hash and stated.file.simulation is not None
 
 
 @pytest.mark.deep  # whole commands: a study of 4 people, and power by two studies of as many

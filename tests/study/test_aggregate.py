@@ -16,11 +16,11 @@ from hilbo.ordinal_gp import Trials, fit
 from hilbo.search.apart import nrmse
 from hilbo.session.choose.ask_tell import physical_trials
 from hilbo.study.analysis.progress import follow
-from hilbo.study.cohort import cohort_of
+from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.estimate.optimum import predict_people
-from hilbo.study.tables.trials import read_trials, write_trials
+from hilbo.study.tables.trials import write_trials
 
 STUDY = Study.load("hilbo/data/paper.toml")
 

@@ -83,7 +83,7 @@ def load(tmp_path, monkeypatch):
 
 def test_a_study_file_becomes_a_record(load):
     study = load(GOOD)
-    assert (study.name, study.responses) == ("memory foam", ("different", "similar", "close"))
+    assert (study.file.name, study.responses) == ("memory foam", ("different", "similar", "close"))
     assert study.space.names == ("K1", "B1", "alpha")
     assert (study.space.parameters[1].low, study.space.parameters[1].unit) == (0.001, "N.s^alpha/mm")
     mechanics = study.space.mechanics
@@ -91,16 +91,16 @@ def test_a_study_file_becomes_a_record(load):
     assert (mechanics.damping, mechanics.effective_damping) == (0.95, None)
     np.testing.assert_array_equal(study.gp.kernel.theta, 30.0)
     np.testing.assert_array_equal(study.gp.likelihood.thresholds, [-0.5, 0.5])
-    assert study.selection == Selection(5, 25, "ucb", 0.7, None)
-    assert (study.inference, study.rule, study.source) == ("laplace", "bcm", "study.toml")
+    assert study.file.selection == Selection(5, 25, "ucb", 0.7, None)
+    assert (study.inference, study.rule, study.file.source) == ("laplace", "bcm", "study.toml")
 
 
 def test_what_is_left_out_has_the_defaults_of_the_paper(load):
     study = load(PLAIN)
     assert study.space.mechanics is None
     assert study.space.parameters[0].scale == "log"
-    assert study.selection == load(GOOD).selection
-    assert (study.inference, study.rule, study.materials) == ("laplace", "bcm", ())
+    assert study.file.selection == load(GOOD).file.selection
+    assert (study.inference, study.rule, study.file.materials) == ("laplace", "bcm", ())
 
 
 def test_theta_may_be_given_for_each_parameter(load):
@@ -109,32 +109,32 @@ def test_theta_may_be_given_for_each_parameter(load):
 
 
 def test_a_dict_and_a_file_give_the_same_study(load):
-    assert Study.from_dict(tomllib.loads(GOOD)).hash == load(GOOD).hash
-    assert load(b"\xef\xbb\xbf" + GOOD.encode()).hash == load(GOOD).hash
+    assert Study.from_dict(tomllib.loads(GOOD)).file.hash == load(GOOD).file.hash
+    assert load(b"\xef\xbb\xbf" + GOOD.encode()).file.hash == load(GOOD).file.hash
 
 
 def test_the_hash_knows_content_and_not_its_spelling(load):
     study = load(GOOD)
-    assert study.hash == hashlib.sha256(study.content.encode()).hexdigest()[:16]
-    assert "minimum_distance" not in study.content  # so that a key added one day changes no hash of today
+    assert study.file.hash == hashlib.sha256(study.file.content.encode()).hexdigest()[:16]
+    assert "minimum_distance" not in study.file.content  # so that a key added one day changes no hash of today
     same = GOOD.replace("theta = 30.0", "theta = 30  # fixed").replace('inference = "laplace"\n', "")
-    assert load(same).hash == study.hash
+    assert load(same).file.hash == study.file.hash
     for old, new in (("noise = 0.5", "noise = 0.6"), ("low = 0.01", "low = 0.02"), ("K_eff = 0.2", "K_eff = 0.3")):
-        assert load(GOOD.replace(old, new)).hash != study.hash
+        assert load(GOOD.replace(old, new)).file.hash != study.file.hash
     first, second = "[parameters.B1]\nlow = 0.001\nhigh = 32.0\n", "[parameters.alpha]\nlow = 0.01\nhigh = 0.99\n"
     plain = GOOD[: GOOD.index("[parameters.B1]")] + "{}" + GOOD[GOOD.index("[renderer]") :]
-    assert load(plain.format(first + second)).hash != load(plain.format(second + first)).hash
+    assert load(plain.format(first + second)).file.hash != load(plain.format(second + first)).file.hash
 
 
 def test_a_material_overrides_renderer_and_parameters(load):
     study = load(GOOD)
-    assert study.materials == ("gel",)
+    assert study.file.materials == ("gel",)
     gel = study.material("gel")
     assert gel.space.mechanics.K_eff == 0.2
     assert gel.space.parameters[0].high == 16
     assert gel.space.parameters[1:] == study.space.parameters[1:]
-    assert (gel.materials, gel.source) == ((), "study.toml")
-    assert gel.hash != study.hash
+    assert (gel.file.materials, gel.file.source) == ((), "study.toml")
+    assert gel.file.hash != study.file.hash
     with pytest.raises(InputError, match=r"study.toml: materials.foam is not in the study, its materials: gel\."):
         study.material("foam")
 
@@ -268,14 +268,14 @@ def test_a_length_is_a_theta_written_otherwise(load, length):
     study = load(GOOD.replace("theta = 30.0", f"length = {length}"))
     theta = {"0.25": 8.0, "[0.25, 0.25, 0.5]": [8.0, 8.0, 2.0]}[length]
     np.testing.assert_array_equal(study.gp.kernel.theta, theta)
-    assert study.hash == load(GOOD.replace("theta = 30.0", f"theta = {theta}")).hash
+    assert study.file.hash == load(GOOD.replace("theta = 30.0", f"theta = {theta}")).file.hash
 
 
 def test_tables_may_hold_numpys_numbers():
     raw = tomllib.loads(GOOD)
     raw["gp"] |= {"thresholds": np.array([-0.5, 0.5]), "noise": np.float64(0.5), "theta": np.float32(30)}
     raw["selection"]["trials"] = np.int64(25)
-    assert Study.from_dict(raw).hash == Study.from_dict(tomllib.loads(GOOD)).hash
+    assert Study.from_dict(raw).file.hash == Study.from_dict(tomllib.loads(GOOD)).file.hash
 
 
 def test_a_table_must_be_a_table():

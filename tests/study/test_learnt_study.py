@@ -21,13 +21,12 @@ from hilbo.population.rules.registry import RECOMMENDED
 from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import to_table
 from hilbo.study.analysis.robustness import robustness
-from hilbo.study.cohort import Cohort, cohort_of
+from hilbo.study.cohort import Cohort, cohort_of, read_trials
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import aggregate_cohort
 from hilbo.study.estimate.best_places import best_places, nearness
 from hilbo.study.estimate.learnt import effect_content, learnt_content, learnt_sentences, resolved, that_learns
 from hilbo.study.estimate.optimum import map_optimum
-from hilbo.study.tables.trials import read_trials
 
 PEOPLE, ANSWERS = 4, 12
 
@@ -185,10 +184,10 @@ def test_one_level_is_no_effect_and_rules_that_do_not_learn_need_no_column(table
 
 
 def test_a_random_effect_is_no_part_of_a_studys_hash():
-    assert study_of(WITH_CLIPS).hash == study_of().hash
+    assert study_of(WITH_CLIPS).file.hash == study_of().file.hash
     for rule in ("", '[aggregation]\nrule = "bcm"\n'):
         plain = SOUND.replace('[aggregation]\nrule = "learnt-1"\n', rule) + PLAIN_GP
-        assert study_of(plain + '[random_effect]\ncolumn = "clip"\n').hash == study_of(plain).hash
+        assert study_of(plain + '[random_effect]\ncolumn = "clip"\n').file.hash == study_of(plain).file.hash
 
 
 def test_a_table_without_the_column_with_an_empty_cell_or_too_many_levels_gets_one_sentence(tmp_path, table):

@@ -21,7 +21,7 @@ from hilbo.search.rendering import Rendering
 from hilbo.simulation.presets import population_of
 from hilbo.simulation.simulate import people
 from hilbo.study.analysis.hills import hills_of
-from hilbo.study.cohort import cohort_of
+from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.config import Study
 from hilbo.study.estimate import distributed
 from hilbo.study.estimate.aggregate import aggregate_cohort
@@ -29,7 +29,7 @@ from hilbo.study.estimate.batch import refit, streamed_cohort
 from hilbo.study.estimate.batch_optimum import optima_from
 from hilbo.study.estimate.learnt import that_learns
 from hilbo.study.formats.json_file import check_values
-from hilbo.study.tables.trials import read_trials, write_trials
+from hilbo.study.tables.trials import write_trials
 from hilbo.study.tables.validation import sets_frame
 from hilbo.study.template import NewStudy, parameter_of, study_text
 
@@ -206,13 +206,13 @@ def test_recipes_begin_with_the_stated_correlation(recipe):
 def test_a_new_study_has_levels():
     new = NewStudy("surfaces", tuple(map(parameter_of, ("hue=0:360:deg", "texture=silk, wood"))), by="person")
     study = Study.from_dict(tomllib.loads(study_text(new)))
-    assert study.space.parameters[1].levels == ("silk", "wood") and set(study.stimulus.tolerance) == {"hue"}
+    assert study.space.parameters[1].levels == ("silk", "wood") and set(study.file.stimulus.tolerance) == {"hue"}
 
 
 def test_a_confirmed_level_is_not_nearly_another():
     with pytest.raises(InputError, match=r"stimulus\.tolerance\.texture is of levels, and another level is none"):
         surfaces(stimulus={"tolerance": {"texture": 1.0}})
-    assert surfaces(stimulus={}).stimulus.off_by(surfaces().space.parameters[1], 1.0) == 0
+    assert surfaces(stimulus={}).file.stimulus.off_by(surfaces().space.parameters[1], 1.0) == 0
 
 
 def test_simulated_people_are_around_a_level():

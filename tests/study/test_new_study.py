@@ -137,7 +137,7 @@ def test_the_recommended_rule_is_the_one_that_is_written(tmp_path):
 def test_the_file_of_a_device_is_one_that_a_device_renders(tmp_path):
     (tmp_path / "study.toml").write_text(study_text(NewStudy("foam", (), device=True)))
     study = Study.load(tmp_path / "study.toml")
-    assert study.space.mechanics is not None and study.stimulus is None and 0 < study.space.volume() < 1
+    assert study.space.mechanics is not None and study.file.stimulus is None and 0 < study.space.volume() < 1
 
 
 def test_the_command_writes_once(tmp_path, capsys, monkeypatch):

@@ -14,8 +14,8 @@ from hilbo.session.log import actions
 from hilbo.session.log.records import RefusedError
 from hilbo.session.plan.participants import add_person, read_people
 from hilbo.session.plan.plan import make_plan
+from hilbo.study.cohort import read_trials
 from hilbo.study.tables.parameter_sets import read_sets
-from hilbo.study.tables.trials import read_trials
 from hilbo.study.tables.validation import read_validation
 
 FORMULAS = ("=1+1", "@SUM(A1)", "+cmd", "-cmd|' /C calc'!A1", "\t=1+1", "=HYPERLINK(A1)")
@@ -92,7 +92,7 @@ def test_an_id_is_one_everywhere(tmp_path, table, person):
     with pytest.raises(InputError, match=r"participant is "):
         read_sets(sets(tmp_path / "sets.csv", source=f"individual:{person}"), ("source", "u", "v"))
     with pytest.raises(InputError, match=r"participant is "):
-        make_plan(STUDY, [person])
+        make_plan(STUDY.file, [person])
     with pytest.raises(InputError, match=r"participant is "):
         add_person(tmp_path / "new.csv", {"participant": person})
 

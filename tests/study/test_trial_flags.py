@@ -13,7 +13,7 @@ from hilbo.study.file.reading import StudyFile
 from hilbo.study.file.trial_flags import FLAGS, flag_sentences, flag_words
 from hilbo.study.folder import read_folder
 from hilbo.study.tables.flag_counts import flag_counts
-from hilbo.study.tables.trials import NothingToFitError, read_trials
+from hilbo.study.tables.trials import NothingToFitError, trial_table
 from hilbo.study.tables.validation import check_validation, read_validation
 
 TOML = """\
@@ -47,7 +47,7 @@ B,2,close,0.6,optimisation,odd,700
 def read(folder, text=TABLE, rule=RULE, **options):
     (folder / "study.toml").write_text(TOML.format(rule=rule))
     (folder / "trials.csv").write_text(text)
-    return read_trials(folder / "trials.csv", StudyFile.load(folder / "study.toml"), **options)
+    return trial_table(folder / "trials.csv", StudyFile.load(folder / "study.toml"), **options)
 
 
 def trials(table):
@@ -73,7 +73,7 @@ def test_without_the_key_every_trial_is_fitted_and_the_digest_is_as_before(tmp_p
     assert StudyFile.load(tmp_path / "study.toml").hash == "e39dc5a71740fb33"  # as before there was such a key
     empty = PLAIN | {"study": PLAIN["study"] | {"exclude_flags": []}}
     named = PLAIN | {"study": PLAIN["study"] | {"exclude_flags": ["hold"]}}
-    assert Study.from_dict(empty).hash == Study.from_dict(PLAIN).hash != Study.from_dict(named).hash
+    assert Study.from_dict(empty).file.hash == Study.from_dict(PLAIN).file.hash != Study.from_dict(named).file.hash
 
 
 def test_a_table_without_a_record_of_flags_is_read_and_that_is_said(tmp_path):

@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 
 from hilbo.errors import InputError, InputRemark
-from hilbo.study.cohort import cohort_of
+from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.config import Study
 from hilbo.study.formats import csv_file
-from hilbo.study.tables.trials import read_trials, write_trials
+from hilbo.study.tables.trials import write_trials
 
 GP = {"theta": 3.0, "variance": 1.0, "thresholds": [-0.5, 0.5], "noise": 0.5}
 HEADER = "participant,trial,response,gain,delay\n"

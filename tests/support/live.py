@@ -28,7 +28,7 @@ def header(kind="optimisation", count=6, warm=2):
     else:
         pairs = [Planned(*pair, first) for pair in itertools.combinations("DEF", 2) for first in ("a", "b")]
         block = Block("validation", len(pairs), tuple(pairs), rest=0.0)
-    return Header(study=STUDY.hash, participant="P01", session="1", seed=0, blocks=(warm_up, block), sets=SETS)
+    return Header(study=STUDY.file.hash, participant="P01", session="1", seed=0, blocks=(warm_up, block), sets=SETS)
 
 
 class FakeChooser:
@@ -98,7 +98,7 @@ class Driver:
 
     def __init__(self, kind="optimisation"):
         self.header = header(kind)
-        self.state, self.events, self.clock = LiveSession.start(STUDY, self.header), [], 0.0
+        self.state, self.events, self.clock = LiveSession.start(STUDY.file, self.header), [], 0.0
         self.accepted = {}
 
     def log(self, event):

@@ -105,12 +105,12 @@ class Live:
 
     def rig(self):
         """Makes what shows renderings."""
-        return functools.partial(DeviceRig, self.study, self.connect)
+        return functools.partial(DeviceRig, self.study.file, self.connect)
 
     def header(self) -> Header:
         """What the log begins with."""
         sets = self.sets()
-        return Header(study=self.study.hash, participant="P01", session="1", seed=0, blocks=self.blocks, sets=sets)
+        return Header(study=self.study.file.hash, participant="P01", session="1", seed=0, blocks=self.blocks, sets=sets)
 
     def connect(self) -> Renderer:
         """The device."""
@@ -122,7 +122,9 @@ class Live:
             self._sooner.setattr(module, name, value)
         resumed = self.path.exists()
         self.log = (
-            EventLog.resume(self.path, self.study) if resumed else EventLog.create(self.path, self.study, self.header())
+            EventLog.resume(self.path, self.study.file)
+            if resumed
+            else EventLog.create(self.path, self.study.file, self.header())
         )
         self.place = serve.bound(0, keys=self.folder / "keys")
         chooser = LiveChooser(self.log.state)
@@ -201,7 +203,7 @@ class Live:
 
     def events(self, kind=None):
         """What is in the log, on the disk."""
-        return [event for event in read_log(self.path, self.study)[1] if kind in (None, event.kind)]
+        return [event for event in read_log(self.path, self.study.file)[1] if kind in (None, event.kind)]
 
     def device_did(self, *conditions: str) -> None:
         """Waits until the log says so: the pages show what a device did before the log holds it."""
@@ -209,8 +211,8 @@ class Live:
 
     def replayed(self) -> LiveSession:
         """The state that the log alone gives."""
-        header, events, _ = read_log(self.path, self.study)
-        return LiveSession.fold(self.study, header, events)
+        header, events, _ = read_log(self.path, self.study.file)
+        return LiveSession.fold(self.study.file, header, events)
 
     def replays(self) -> None:
         """Waits until the log alone gives the state; the session may go on meanwhile."""

@@ -110,7 +110,7 @@ class LiveStimulus(Live):
         return SETS
 
     def rig(self):
-        return functools.partial(StimulusRig, self.study, "tag")
+        return functools.partial(StimulusRig, self.study.file, "tag")
 
     def link(self):
         """A new one for the stimulus."""

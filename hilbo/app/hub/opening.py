@@ -19,12 +19,14 @@ from hilbo.session.choose.look_ahead import LiveChooser, warm_start_sources
 from hilbo.session.choose.warm_start import read_warm_start
 from hilbo.session.log.event_log import EventLog
 from hilbo.session.log.header import header_for, participant_seed
+from hilbo.session.log.header_check import study_of
 from hilbo.session.log.log_files import begun, log_name
 from hilbo.session.log.records import Header
 from hilbo.session.log.state import LiveSession
 from hilbo.session.plan.participants import check_consent, read_people
 from hilbo.session.plan.plan import planned_by, planned_header, read_plan
 from hilbo.study.config import Study
+from hilbo.study.file.reading import StudyFile
 
 __all__ = ["Wanted", "let_go", "opened"]
 
@@ -52,7 +54,7 @@ def opened(
 ) -> tuple[Hub, EventLog]:
     """The hub of a session, new or resumed, and its open log; `connect(damping, delay)` opens a device that has at
     least this damping (N·s/m) and at most this delay (s). Raises `InputError`."""
-    study = Study.load(wanted.study)
+    study = Study.load(wanted.study).file
     say("preparing what chooses")
     import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
 
@@ -83,11 +85,11 @@ def let_go(log: EventLog, resumed: bool = False) -> None:
         log.path.unlink(missing_ok=True)
 
 
-def _mechanics(study, material) -> Any:
-    return (study if material is None else study.material(material)).space.mechanics
+def _mechanics(study: StudyFile, material: str | None) -> Any:
+    return study_of(study, material).space.mechanics
 
 
-def _begun(wanted, study) -> tuple[EventLog, LiveChooser]:
+def _begun(wanted: Wanted, study: StudyFile) -> tuple[EventLog, LiveChooser]:
     """A new log, last of all: what is refused leaves none behind."""
     if wanted.plan is None and wanted.material is None and study.materials:
         names = ", ".join(study.materials)
@@ -106,7 +108,7 @@ def _begun(wanted, study) -> tuple[EventLog, LiveChooser]:
     return EventLog.create(path, study, header), chooser
 
 
-def _resumed(wanted, study) -> tuple[EventLog, LiveChooser]:
+def _resumed(wanted: Wanted, study: StudyFile) -> tuple[EventLog, LiveChooser]:
     header = _header(wanted._replace(dry_run=True), study)  # consent was looked for when it began
     log = EventLog.resume(wanted.logs / log_name(header), study)
     try:
@@ -139,7 +141,7 @@ def _check_asked_for(wanted, header: Header, log: EventLog) -> None:
         raise InputError(f"{log.path}: was begun by another plan, or without one; give that one, or another --session.")
 
 
-def _header(wanted, study) -> Header:
+def _header(wanted: Wanted, study: StudyFile) -> Header:
     number = study.session.protocol_number
     facts: dict[str, Any] = {"protocol_number": number, "versions": _versions()}
     if study.stimulus is not None:
@@ -184,7 +186,7 @@ def _materials(header: Header) -> list[str]:
     return list(dict.fromkeys(block.material or "none" for block in header.blocks))
 
 
-def _warm_starts(wanted, study, header) -> dict[str | None, Any]:
+def _warm_starts(wanted: Wanted, study: StudyFile, header: Header) -> dict[str | None, Any]:
     """Material -> what its choices begin with. The candidates are those of the session's seed, not of the command's."""
     if wanted.warm_start is None:
         return {}
@@ -192,8 +194,7 @@ def _warm_starts(wanted, study, header) -> dict[str | None, Any]:
     if not materials:
         raise InputError("--warm-start: in this session nothing is chosen, all is planned; leave it out.")
     return {
-        name: read_warm_start(wanted.warm_start, study if name is None else study.material(name), header.seed)
-        for name in materials
+        name: read_warm_start(wanted.warm_start, Study.of(study_of(study, name)), header.seed) for name in materials
     }
 
 

@@ -156,7 +156,7 @@ def rehearse(
     out.mkdir(parents=True, exist_ok=True)
     file = fast_study(source, out / "study.toml", seconds, warm_up)
     study = Study.load(file)
-    material = next(iter(study.materials), None)
+    material = next(iter(study.file.materials), None)
     here = study if material is None else study.material(material)
     population = with_truth(here, population_of(here, preset)[1], seed)
     arguments = [str(file), "--participant", "P01", "--logs", str(out / "logs"), "--port", "0"]
@@ -169,12 +169,12 @@ def rehearse(
     else:
         arguments += ["--seed", str(seed)] + ([] if material is None else ["--material", material])
     say("starting the server")
-    rendered = _by_device if study.stimulus is None else functools.partial(_by_stand_in, study)
+    rendered = _by_device if study.file.stimulus is None else functools.partial(_by_stand_in, study.file)
     with rendered(arguments, Decider(here, population, seed)) as (links, decide, touches), browser() as program:
         say("in session")
         summary = _session(program, links, decide, touches, out, say)
     summary["log"] = links["log"]
-    summary["events"] = len(read_log(links["log"], study)[1])
+    summary["events"] = len(read_log(links["log"], study.file)[1])
     (out / "result.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")
     return summary
 
@@ -207,7 +207,9 @@ def _plan(study, material, sets, phase, seed) -> dict[str, Any]:
     if phase == "aggregate-best":
         sets = {"aggregate": sets["best"], "individual:S1": sets["mid"], "individual:S2": sets["worst"]}
     materials = () if material is None else (material,)
-    return make_plan(study, ["P01"], seed, phase, materials=materials, sets={material or "": sets}, source="aggregate")
+    return make_plan(
+        study.file, ["P01"], seed, phase, materials=materials, sets={material or "": sets}, source="aggregate"
+    )
 
 
 def _session(program, links, decide, touches, out, say) -> dict[str, Any]:

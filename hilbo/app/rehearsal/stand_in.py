@@ -13,7 +13,7 @@ from typing import Any
 from hilbo.app.rehearsal.robot import Client
 from hilbo.app.wire.security import Role
 from hilbo.session.log.presented import in_numbers
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 
 __all__ = ["StandIn"]
 
@@ -25,7 +25,7 @@ _AGAIN = 0.1  # s until a server that did not take a report is asked again
 class StandIn:
     """Joins by the link of `role`, and presents in a thread of its own until `close`."""
 
-    def __init__(self, study: AnyStudy, link: str, role: Role):
+    def __init__(self, study: StudyFile, link: str, role: Role):
         self._study, self._client, self._path = study, Client(link), f"/api/{role}"
         self._presented: dict[int, dict[str, Mapping[str, float]]] = {}
         self._ended = threading.Event()

@@ -23,7 +23,7 @@ from hilbo.device.messages import Status
 from hilbo.device.reasons import DeviceFlag, HoldReason, held_because
 from hilbo.hardware_bridge import Capability, DeviceError, ParameterSet, Renderer, State
 from hilbo.session.log.header_check import study_of
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 
 __all__ = ["DeviceRig"]
 
@@ -41,7 +41,7 @@ class DeviceRig:
 
     def __init__(
         self,
-        study: AnyStudy,
+        study: StudyFile,
         connect: Callable[[], Renderer],
         changed: Callable[[Snapshot], Any] = lambda _: None,
         notice: Callable[[str], Any] = lambda _: None,

@@ -10,7 +10,7 @@ from hilbo.search.box import Parameter
 from hilbo.session.log.header_check import study_of
 from hilbo.session.log.presented import in_words
 from hilbo.session.plan.set_codes import label_of
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 
 __all__ = ["Order", "as_sent", "parameters_of"]
 
@@ -24,7 +24,7 @@ class Order(NamedTuple):
     trial: str = ""
 
 
-def as_sent(order: Order, study: AnyStudy, tag: str) -> dict[str, Any]:
+def as_sent(order: Order, study: StudyFile, tag: str) -> dict[str, Any]:
     """The message that gives an order; `tag` is what trials of the session are known by."""
     assert study.stimulus is not None  # nobody else is given orders
     showing = order.showing
@@ -43,13 +43,13 @@ def as_sent(order: Order, study: AnyStudy, tag: str) -> dict[str, Any]:
     }
 
 
-def parameters_of(study: AnyStudy) -> list[dict[str, Any]]:
+def parameters_of(study: StudyFile) -> list[dict[str, Any]]:
     """What the parameters of orders may be, and how far off a confirmation may be, in their units. On a logarithmic
     scale, where that grows with the value, it is told for the low end, and as a share."""
     return [_parameter(study, p) for p in study.space.parameters]
 
 
-def _parameter(study: AnyStudy, p: Parameter) -> dict[str, Any]:
+def _parameter(study: StudyFile, p: Parameter) -> dict[str, Any]:
     assert study.stimulus is not None
     if p.levels:
         return {"name": p.name, "levels": list(p.levels)}

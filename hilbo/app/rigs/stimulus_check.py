@@ -11,7 +11,7 @@ from hilbo.app.rigs.rig import Showing
 from hilbo.app.rigs.stimulus_rig import StimulusRig
 from hilbo.app.wire.watchers import Watchers
 from hilbo.errors import InputError
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 
 __all__ = ["Measured", "StimulusCheck"]
 
@@ -32,7 +32,7 @@ class StimulusCheck:
     """In the place of a hub, for `serve`. It waits `patience` s for the program; `done` is called in the end, once
     `measured` is there."""
 
-    def __init__(self, study: AnyStudy, patience: float):
+    def __init__(self, study: StudyFile, patience: float):
         self.rig = StimulusRig(study, "check")
         self.watchers = Watchers(lambda: "")
         self.measured: Measured | None = None

@@ -22,7 +22,7 @@ from hilbo.errors import InputError
 from hilbo.session.log.header_check import study_of
 from hilbo.session.log.presented import check_confirmed, in_numbers
 from hilbo.session.log.records import RefusedError
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 
 __all__ = ["OverError", "StimulusRig"]
 
@@ -54,7 +54,7 @@ class StimulusRig:
 
     def __init__(
         self,
-        study: AnyStudy,
+        study: StudyFile,
         tag: str,
         changed: Callable[[Snapshot], Any] = lambda _: None,
         notice: Callable[[str], Any] = lambda _: None,

@@ -14,7 +14,7 @@ import numpy as np
 from hilbo.app.interface import HubInterface
 from hilbo.errors import InputError
 from hilbo.study.file.protocols import protocol
-from hilbo.study.file.reading import AnyStudy, StudyFile
+from hilbo.study.file.reading import StudyFile
 
 __all__ = ["FIXED", "NAMES", "STATES", "Tried", "check_study", "hidden_reference"]
 
@@ -29,7 +29,7 @@ _MIDDLE = (0.2, 0.8)  # of each range: where the reference may be, so that answe
 class Tried:
     """The end of the page's and the model's. `study` is the session's, `reference` parameter -> physical value."""
 
-    def __init__(self, study: AnyStudy, reference: Mapping[str, float]):
+    def __init__(self, study: StudyFile, reference: Mapping[str, float]):
         self._study, self._reference = study, dict(reference)
 
     async def facts(self, _hub: HubInterface) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def check_study(study: StudyFile) -> None:
         )
 
 
-def hidden_reference(study: AnyStudy, seed: int) -> dict[str, float]:
+def hidden_reference(study: StudyFile, seed: int) -> dict[str, float]:
     """The reference of a seed: parameter -> physical value, anywhere in the middle of the ranges."""
     unit = np.random.default_rng([seed, len(NAMES)]).uniform(*_MIDDLE, study.space.dim)
     return {p.name: float(p.to_physical(u)) for p, u in zip(study.space.parameters, unit, strict=True)}

@@ -26,7 +26,7 @@ def effects_figure(study: Study, effects: Sequence[Effect], optimum: Float[np.nd
         axes.remove()
     for i, (axes, effect) in enumerate(zip(grid.ravel(), effects, strict=False)):
         label_axes(axes, study, i, i)
-        axes.set(yscale="linear", ylabel=f"{study.attribute} f" if i % across == 0 else "")
+        axes.set(yscale="linear", ylabel=f"{study.file.attribute} f" if i % across == 0 else "")
         _draw(axes, effect, study.space.parameters[i].discrete, best[i])
     for axes in grid.ravel()[: len(effects)]:
         axes.autoscale(axis="y")

@@ -178,7 +178,7 @@ def map_panels(study: Study, grids):
     size = (ONE_COLUMN, 2.9) if len(grids) == 1 else (TWO_COLUMNS, 2.6)
     figure, ((*panels,),) = new_figure(*size, 1, len(grids), sharey=True, squeeze=False)
     scale = ScalarMappable(Normalize(low, high), "cividis")
-    bar = figure.colorbar(scale, ax=panels, label=f"{study.attribute} f", fraction=0.05, pad=0.02)
+    bar = figure.colorbar(scale, ax=panels, label=f"{study.file.attribute} f", fraction=0.05, pad=0.02)
     few_ticks(bar.ax.yaxis, 5)
     for axes in panels:
         label_axes(axes, study, 0, 1)
@@ -257,7 +257,7 @@ def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.n
 def label_curve(axes, study: Study) -> None:
     """Axes of a map of one parameter."""
     label_axes(axes, study, 0, 0)
-    axes.set(yscale="linear", ylabel=f"{study.attribute} f")
+    axes.set(yscale="linear", ylabel=f"{study.file.attribute} f")
 
 
 def draw_curve(axes, study: Study, curve: Sequence[np.ndarray], sd_label: str = "", label: str = "") -> None:

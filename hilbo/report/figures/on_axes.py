@@ -50,7 +50,7 @@ def draw_map(
     grid = plane(study, best, (i, j), _CELLS)
     mean = grid.image(_mean_and_variance(model, grid.points)[0])
     drawn = axes.pcolormesh(*grid.sides, mean, cmap="cividis", shading="nearest", rasterized=True)
-    axes.figure.colorbar(drawn, ax=axes, label=f"{study.attribute} f (mean)")
+    axes.figure.colorbar(drawn, ax=axes, label=f"{study.file.attribute} f (mean)")
     label_axes(axes, study, i, j)
     star(axes, study, best, (i, j))
     held = [level_words(study, k, float(best[k])) for k in range(len(names)) if k not in (i, j)]

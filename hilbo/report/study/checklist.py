@@ -57,8 +57,8 @@ def _data(analysis):
     counts, study = analysis.cohort.counts(), analysis.study
     many = f"{counts.min()}" if counts.min() == counts.max() else f"{counts.min()} to {counts.max()}"
     return (
-        f"{len(counts)} participants, {many} answers each ({', '.join(study.responses)}) on {study.attribute}, over"
-        f" {', '.join(study.space.names)}; left out by the rule stated before: {len(analysis.left_out)}."
+        f"{len(counts)} participants, {many} answers each ({', '.join(study.responses)}) on {study.file.attribute},"
+        f" over {', '.join(study.space.names)}; left out by the rule stated before: {len(analysis.left_out)}."
     )
 
 
@@ -69,7 +69,7 @@ def _model(analysis):
         f"Ordinal probit likelihood on a latent Gaussian process with a {covariance_words(gp.kernel)} covariance of the"
         f" normalised parameters, {formula(gp.kernel)}; thresholds {_each(gp.likelihood.thresholds)}, noise"
         f" {_each(gp.likelihood.noise)}; all {given}; people aggregated by the rule {study.rule}"
-        + (f", with a random effect of {study.random_effect}." if analysis.aggregate.map.effects else ".")
+        + (f", with a random effect of {study.file.random_effect}." if analysis.aggregate.map.effects else ".")
     )
 
 

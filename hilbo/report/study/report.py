@@ -74,7 +74,7 @@ def write_study(
         content, section = _write_material(material, analysis, validated, comparison_content, material_folder, seed)
         contents[material.name] = content
         sections.append(section)
-    claims = hypotheses(results) if folder.study.report.hypotheses else []
+    claims = hypotheses(results) if folder.study.file.report.hypotheses else []
     content = _content(folder, contents, claims, seed)
     (out / "result.json").write_text(as_json(content), encoding="utf-8")
     say("the page")
@@ -105,7 +105,7 @@ def _content(folder: StudyFolder, contents, claims, seed) -> dict[str, Any]:
     return {
         "materials": contents,
         "hypotheses": [{"number": h.number, "evidence": [e._asdict() for e in h.evidence]} for h in claims],
-        "study": folder.study.hash,
+        "study": folder.study.file.hash,
         "seed": seed,
         "versions": versions(),
         "warnings": named_warnings(contents),
@@ -201,7 +201,7 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "answers": int(analysis.cohort.counts().sum()),
         "limits": analysis.limits,
         "left_out": analysis.left_out,
-        "flags": flag_sentences(material.flags, analysis.study.exclude_flags),
+        "flags": flag_sentences(material.flags, analysis.study.file.exclude_flags),
         "figures": pictures,
         "typical": analysis.cohort.names[typical_person(analysis)],
         "unknown": UNKNOWN,

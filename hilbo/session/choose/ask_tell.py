@@ -64,11 +64,11 @@ class Session:
     step: Step = field(repr=False)
 
     def __repr__(self) -> str:
-        of, asked = self.study.selection.trials, ""
+        of, asked = self.study.file.selection.trials, ""
         if self.proposal is not None:
             values = zip(self.study.space.parameters, self.proposal.tolist(), strict=True)
             asked = ", asks " + ", ".join(f"{p.name} {p.words(value)} {p.unit}".rstrip() for p, value in values)
-        return f'Session("{self.study.name}": {len(self.answers)} of {of} answers{asked})'
+        return f'Session("{self.study.file.name}": {len(self.answers)} of {of} answers{asked})'
 
     @classmethod
     def start(cls, study: Study, seed: int = 0) -> "Session":
@@ -98,7 +98,7 @@ class Session:
     @property
     def trials(self) -> Trials:
         """The answers as the model's data, with the capacity of the whole session."""
-        return physical_trials(self.study, self.points, self.answers, self.study.selection.trials)
+        return physical_trials(self.study, self.points, self.answers, self.study.file.selection.trials)
 
     @property
     def done(self) -> bool:

@@ -103,7 +103,7 @@ def next_point(
     if len(excluded) and _distances(study, _to_unit(study, fitted.point[None]), excluded).min() < APART:
         point = _highest_apart(study, session.plan, fitted.posterior, _padded(study, excluded))
         return np.asarray(point), "ucb, apart"
-    return fitted.point, study.selection.acquisition
+    return fitted.point, study.file.selection.acquisition
 
 
 def unanswered(initial: Float[np.ndarray, "k d"], proposed: Points, excluded: Points) -> list[Float[np.ndarray, " d"]]:
@@ -213,7 +213,7 @@ def explained(study: Study, posterior: Posterior, point: Float[np.ndarray, " d"]
         "unit": predicted.unit.tolist(),
         "mean": mean,
         "sd": sd,
-        "score": mean + study.selection.weight * sd if by.startswith("ucb") else None,
+        "score": mean + study.file.selection.weight * sd if by.startswith("ucb") else None,
         "probabilities": dict(zip(study.responses, predicted.probabilities.tolist(), strict=True)),
         "margin": rendering.margin,
         "certificate": {f.name: getattr(certificate, f.name).item() for f in dataclasses.fields(certificate)},

@@ -1,6 +1,6 @@
 """Ask and tell with a log: a session from a notebook or a script, by the code of the live one.
 
-    with LoggedSession.open("logs", study, header_for(study, "P01", seed=1, warm=False)) as session:
+    with LoggedSession.open("logs", study, header_for(study.file, "P01", seed=1, warm=False)) as session:
         while (point := session.ask()) is not None:
             session.tell(felt(point))
 
@@ -37,9 +37,9 @@ class LoggedSession:
         """Begin a session, or go on with the one of this participant and label. Raises InputError."""
         path = Path(folder) / log_name(header)
         if not begun(path):
-            log = EventLog.create(path, study, header)
+            log = EventLog.create(path, study.file, header)
             return cls(log, LiveChooser(log.state))
-        log = EventLog.resume(path, study)
+        log = EventLog.resume(path, study.file)
         if log.state.header != msgspec.structs.replace(header, schema=log.state.header.schema):
             log.close()
             raise InputError(f"{path}: was begun with another seed, plan or sets; give those, or another label.")

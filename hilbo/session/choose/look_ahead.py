@@ -45,8 +45,7 @@ class LiveChooser:
         self._lock = threading.RLock()
         self._choices: dict[Answers, dict[str, Any]] = {}
         self._fitted: dict[tuple, Fitted] = {}
-        header, study = state.header, state.study
-        assert isinstance(study, Study)  # whoever chooses needs the model too
+        header, study = state.header, Study.of(state.study)
         self._blocks = header.blocks
         self._studies = {b.material: study if b.material is None else study.material(b.material) for b in header.blocks}
         self._sessions = {

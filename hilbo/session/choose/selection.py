@@ -20,7 +20,7 @@ from hilbo.numerics.climbing import Choice, climb, spread
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.search.apart import differences
 from hilbo.search.candidates import CANDIDATES, search_points
-from hilbo.search.lattice import Lattice, nodes_for, screen, screen_points
+from hilbo.search.lattice import Lattice, OptimisticScore, nodes_for, screen, screen_points
 from hilbo.search.space import SearchSpace
 from hilbo.search.space_lattice import lattice_of
 from hilbo.study.config import Inference, Study
@@ -45,7 +45,7 @@ class Choosing(eqx.Module):
     @classmethod
     def of(cls, study: Study) -> "Choosing":
         """Without the numbers of the selection that are no part of a program."""
-        selection = msgspec.structs.replace(study.selection, space_filling=0, weight=0.0)
+        selection = msgspec.structs.replace(study.file.selection, space_filling=0, weight=0.0)
         return cls(study.gp, study.space, study.inference, selection)
 
 
@@ -65,9 +65,9 @@ class Design(eqx.Module):
 def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
     """The seeded part of a session: space-filling points (s, d), and the points to search, in the unit cube."""
     space, nodes = study.space, nodes_for(float(np.asarray(study.gp.kernel.theta).max()))
-    on_lattice = space.even and space.dim in (2, 3) and study.selection.acquisition != "thompson"
+    on_lattice = space.even and space.dim in (2, 3) and study.file.selection.acquisition != "thompson"
     return Design(
-        jax.device_put(space.latin_hypercube(study.selection.space_filling, seed)),
+        jax.device_put(space.latin_hypercube(study.file.selection.space_filling, seed)),
         None if on_lattice else search_points(space, seed, count),
         lattice_of(space, nodes) if on_lattice else None,
         jax.random.key(seed),
@@ -82,25 +82,22 @@ def next_point(
     `weight`: of the standard deviation in UCB, if it is not to be the study's.
     """
     posterior = fit(study.gp, trials, inference=study.inference, throw=False)
-    return point_after(study, plan, posterior, trial, weight)
+    weight = study.file.selection.weight if weight is None else weight
+    return point_after(Choosing.of(study), plan, posterior, trial, weight)
 
 
 def point_after(
-    study: Study | Choosing,
-    plan: Design,
-    posterior: Posterior,
-    trial: Int[Array, ""] | int,
-    weight: ArrayLike | None = None,
+    choosing: Choosing, plan: Design, posterior: Posterior, trial: Int[Array, ""] | int, weight: ArrayLike
 ) -> Float[Array, " d"]:
-    """The same from the posterior of the answers."""
-    thompson, distance = study.selection.acquisition == "thompson", study.selection.minimum_distance
+    """The same from the posterior of the answers; `weight`: of the standard deviation in UCB."""
+    thompson, distance = choosing.selection.acquisition == "thompson", choosing.selection.minimum_distance
     allowed = None
     if distance:
         points, usable = _searched(plan, _JOINT_CANDIDATES if thompson else None)
-        allowed = _apart_from(study.gp.kernel.levels, posterior.trials, points, usable, distance)
+        allowed = _apart_from(choosing.gp.kernel.levels, posterior.trials, points, usable, distance)
     if thompson:
         return _thompson_point(posterior, plan, trial, allowed)
-    return _highest(study, plan, posterior, _score(study, posterior, weight), allowed).x
+    return _highest(choosing, plan, posterior, _score(choosing, posterior, weight), allowed).x
 
 
 def point_apart(
@@ -111,22 +108,25 @@ def point_apart(
     def allowed(x):
         return jnp.all(jnp.sum(differences(study.gp.kernel.levels, excluded, x[None, :]) ** 2, axis=1) >= apart**2)
 
-    return _highest(study, plan, posterior, acquisition.UCB(study.selection.weight), allowed).x
+    return _highest(Choosing.of(study), plan, posterior, acquisition.UCB(study.file.selection.weight), allowed).x
 
 
-def _highest(study, plan, posterior, score, allowed=None) -> Choice:
+def _highest(
+    choosing: Choosing, plan: Design, posterior: Posterior, score: OptimisticScore, allowed: Callable | None = None
+) -> Choice:
     """Where a score is largest in the feasible set; screened in float32."""
 
     def score_at(x):
         mean, variance = posterior.predict(x[None, :])
         return score(mean[0], variance[0])
 
-    space = study.space.searched
-    if study.selection.acquisition == "ucb":
-        space["gain"] = _GAIN * jnp.sqrt(study.gp.kernel.variance)
+    space = choosing.space.searched
+    if choosing.selection.acquisition == "ucb":
+        space["gain"] = _GAIN * jnp.sqrt(choosing.gp.kernel.variance)
     short = posterior.astype(jnp.float32)
     fitted = short.gp.kernel, short.trials.x, short.latent.weights, short.latent.factor
     if plan.lattice is None:
+        assert plan.candidates is not None
         points = plan.candidates
         if allowed is None:
             values = screen_points(*fitted, points.astype(jnp.float32), score)
@@ -139,14 +139,14 @@ def _highest(study, plan, posterior, score, allowed=None) -> Choice:
     return climb(screened.points[rows], usable, score_at, **space, allowed=allowed)
 
 
-def _score(study, posterior, weight):
-    kind = study.selection.acquisition
+def _score(choosing: Choosing, posterior: Posterior, weight: ArrayLike) -> OptimisticScore:
+    kind = choosing.selection.acquisition
     if kind == "ucb":
-        return acquisition.UCB(study.selection.weight if weight is None else weight)
+        return acquisition.UCB(weight)
     if kind == "log_ei":
         trials = posterior.trials
         return acquisition.LogEI(jnp.max(jnp.where(trials.mask, posterior.mean(trials.x), -jnp.inf)))
-    return acquisition.TopCategory(study.gp.likelihood.thresholds[-1], study.gp.likelihood.noise)
+    return acquisition.TopCategory(choosing.gp.likelihood.thresholds[-1], choosing.gp.likelihood.noise)
 
 
 def _searched(plan: Design, count: int | None) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:

@@ -55,7 +55,7 @@ class Step:
 
     def __init__(self, study: Study, plan: Design) -> None:
         self._study, self._plan, self._choosing = study, plan, Choosing.of(study)
-        self.weight, self.capacity = float(study.selection.weight), study.selection.trials
+        self.weight, self.capacity = float(study.file.selection.weight), study.file.selection.trials
         self._low, self._high = (np.array([getattr(p, end) for p in study.space.parameters]) for end in ("low", "high"))
         self.initial: Float[np.ndarray, "s d"] = self._physical(_to_physical(study.space, plan.initial))
         self.responses, self.names = study.responses, study.space.names

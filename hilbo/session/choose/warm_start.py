@@ -77,7 +77,7 @@ def warm_point(
 ) -> Float[Array, " d"]:
     """The candidate (d,) to ask after a participant's answers, `apart` or farther from the `excluded`; traceable."""
     mean, variance = informed(study, warm, posterior)
-    score = mean + study.selection.weight * jnp.sqrt(variance)
+    score = mean + study.file.selection.weight * jnp.sqrt(variance)
     if excluded is not None:
         away = differences(study.gp.kernel.levels, warm.points[:, None, :], excluded[None, :, :])
         distance = jnp.sum(away**2, axis=2)

@@ -1,6 +1,6 @@
 """What the columns of exported tables mean, in words; and what one is called that holds a parameter of one side."""
 
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.file.trial_flags import FLAGS
 
 __all__ = ["UNWRITTEN", "column_words", "presented_column"]
@@ -41,7 +41,7 @@ _WORDS = {
 }
 
 
-def column_words(study: AnyStudy, kind: str) -> dict[str, str]:
+def column_words(study: StudyFile, kind: str) -> dict[str, str]:
     """What the columns of a table of this kind mean. In tables without parameters no column is one, whatever the study
     calls its own."""
     words = dict(_WORDS)

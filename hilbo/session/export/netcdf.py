@@ -8,14 +8,14 @@ import xarray as xr
 
 from hilbo.session.export.tables import trials_table
 from hilbo.session.log.state import LiveSession
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.tables.flag_counts import flagged
 from hilbo.study.tables.trials import is_fitted
 
 __all__ = ["netcdf"]
 
 
-def netcdf(sessions: Sequence[LiveSession], path: Path, study: AnyStudy) -> bool:
+def netcdf(sessions: Sequence[LiveSession], path: Path, study: StudyFile) -> bool:
     """The answers to single renderings that are fitted, without warm-up, repeats and excluded flags, as groups of a
     netCDF file: observed_data has the categories and constant_data what they are about, along `obs_id`, levels by
     their names; attributes name the study. xarray reads it as a DataTree, ArviZ as InferenceData. False, and no

@@ -13,7 +13,7 @@ from hilbo.session.export.columns import column_words
 from hilbo.session.export.tables import presentations_table, sessions_table, sets_table, trials_table, validation_table
 from hilbo.session.log.log_files import log_name
 from hilbo.session.log.state import LiveSession
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.cell_text import check_text
 from hilbo.study.tables.trials import write_trials
 
@@ -28,7 +28,7 @@ _TABLES = {
 }
 
 
-def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: AnyStudy) -> list[Path]:
+def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: StudyFile) -> list[Path]:
     """Tables with their sidecars and dataset_description.json; the files. Raises InputError for an id, label or name of
     a set that a spreadsheet would run."""
     for state in sessions:
@@ -49,7 +49,7 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: AnyStudy) -> 
     return [*written, path]
 
 
-def _write(table: pd.DataFrame, variables: list[dict[str, str]], data: Path, kind: str, study: AnyStudy) -> list[Path]:
+def _write(table: pd.DataFrame, variables: list[dict[str, str]], data: Path, kind: str, study: StudyFile) -> list[Path]:
     """A table and its sidecar."""
     name = re.sub(r"[^A-Za-z0-9]", "", study.name) or "study"
     path = data / f"study-{name}_table-{kind}_data.csv"
@@ -60,7 +60,7 @@ def _write(table: pd.DataFrame, variables: list[dict[str, str]], data: Path, kin
     return [path, sidecar]
 
 
-def _description(study: AnyStudy, logs: int, variables: list[dict[str, str]]) -> dict[str, Any]:
+def _description(study: StudyFile, logs: int, variables: list[dict[str, str]]) -> dict[str, Any]:
     return {
         "@context": "https://schema.org/",
         "@type": "Dataset",

@@ -3,7 +3,7 @@
 `trials_table` is a trial table (every answer to one rendering; voided and undone ones marked so), `validation_table`
 and `sets_table` are those of `hilbo.study.tables.validation` (voided comparisons left out), `presentations_table` has
 every trial that was ever proposed, and what became of it, `sessions_table` the plan that each session was held by.
-`read_log_trials` reads a folder of logs as `hilbo.study.tables.trials.read_trials` reads the exported table, through
+`read_log_trials` reads a folder of logs as `hilbo.study.tables.trials.trial_table` reads the exported table, through
 the very same text, so that both give the same bits.
 """
 
@@ -22,11 +22,11 @@ from hilbo.session.log.log_files import log_paths
 from hilbo.session.log.presented import in_words
 from hilbo.session.log.records import Trial
 from hilbo.session.log.state import LiveSession
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES, SAMPLES, flag_words
 from hilbo.study.formats.cell_text import runs_in_a_spreadsheet
 from hilbo.study.tables.parameter_sets import role_of, source_of
-from hilbo.study.tables.trials import read_trials, write_trials
+from hilbo.study.tables.trials import trial_table, write_trials
 
 __all__ = [
     "computes_sets",
@@ -43,7 +43,7 @@ _SINGLE = ("warm-up", "optimisation", "repeat")
 
 
 def read_sessions(
-    folder: str | os.PathLike, study: AnyStudy, note: Callable[[str], Any] = lambda sentence: None
+    folder: str | os.PathLike, study: StudyFile, note: Callable[[str], object] = lambda sentence: None
 ) -> list[LiveSession]:
     """Every session in a folder but dry runs; `note` is told of those, and of logs that are cut off.
 
@@ -121,7 +121,7 @@ def validation_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
     return _table(rows)
 
 
-def _confirmed(study: AnyStudy, trial: Trial) -> dict[str, float | str]:
+def _confirmed(study: StudyFile, trial: Trial) -> dict[str, float | str]:
     """What was presented on either side, in columns that no parameter's own name can be; {} where a device renders."""
     if study.stimulus is None:
         return {}
@@ -199,14 +199,14 @@ def sessions_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
 
 def read_log_trials(
     folder: str | os.PathLike,
-    study: AnyStudy,
+    study: StudyFile,
     material: str | None = None,
     *,
     others: bool = True,
     say: Callable[[int], None] = lambda rows: None,
-    note: Callable[[str], Any] = lambda sentence: None,
+    note: Callable[[str], object] = lambda sentence: None,
 ) -> pd.DataFrame:
-    """As `hilbo.study.tables.trials.read_trials`, from a folder of session logs; `study` is the whole one, of all
+    """As `hilbo.study.tables.trials.trial_table`, from a folder of session logs; `study` is the whole one, of all
     materials."""
     table = trials_table(read_sessions(folder, study, note))
     if table.empty:
@@ -220,7 +220,7 @@ def read_log_trials(
             note(sentence.replace(str(path), str(folder)))
 
         try:
-            return read_trials(path, chosen, material, others=others, say=say, note=note_of_logs)
+            return trial_table(path, chosen, material, others=others, say=say, note=note_of_logs)
         except InputError as error:
             raise InputError(str(error).replace(str(path), str(folder))) from None
 

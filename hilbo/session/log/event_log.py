@@ -20,7 +20,7 @@ from hilbo.session.log.rescue import fault_of, rescue
 from hilbo.session.log.state import LiveSession
 from hilbo.study.disk.lock import lock
 from hilbo.study.disk.new_file import sync_folder
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.json_file import read_bytes
 
 __all__ = ["EventLog", "LogError", "LogLostError", "read_log", "read_session"]
@@ -64,7 +64,7 @@ class EventLog:
         self._torn, self._fault, self._copy = False, "", None
 
     @classmethod
-    def create(cls, path: str | os.PathLike, study: AnyStudy, header: Header) -> "EventLog":
+    def create(cls, path: str | os.PathLike, study: StudyFile, header: Header) -> "EventLog":
         """Begin a log. Raises InputError if there is one already, or it cannot be written."""
         path = Path(path)
         state = LiveSession.start(study, header)
@@ -91,7 +91,7 @@ class EventLog:
         return log
 
     @classmethod
-    def resume(cls, path: str | os.PathLike, study: AnyStudy) -> "EventLog":
+    def resume(cls, path: str | os.PathLike, study: StudyFile) -> "EventLog":
         """Open a log to go on with it; a last line that is not whole is cut off. Raises InputError."""
         path = Path(path)
         try:
@@ -180,7 +180,7 @@ class EventLog:
         self.close()
 
 
-def read_log(path: str | os.PathLike, study: AnyStudy | None = None) -> tuple[Header, list[Event], str]:
+def read_log(path: str | os.PathLike, study: StudyFile | None = None) -> tuple[Header, list[Event], str]:
     """Header, events, and what was dropped at the end; for readers, without a lock. Raises InputError."""
     header, events, _, dropped = read_lines(read_bytes(path), path)
     if study is not None:
@@ -189,7 +189,7 @@ def read_log(path: str | os.PathLike, study: AnyStudy | None = None) -> tuple[He
 
 
 def read_session(
-    path: str | os.PathLike, study: AnyStudy, note: Callable[[str], Any] = lambda sentence: None
+    path: str | os.PathLike, study: StudyFile, note: Callable[[str], Any] = lambda sentence: None
 ) -> LiveSession:
     """The session of a log, every event checked; for readers, without a lock. `note` is told of what was dropped at the
     end. Raises InputError."""

@@ -9,7 +9,7 @@ import numpy as np
 from hilbo.session.log.header_check import SCHEMA, study_of
 from hilbo.session.log.records import Block, Header, Planned
 from hilbo.study.file.protocols import protocol
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 
 __all__ = ["header_for", "header_of", "material_seed", "participant_seed", "seed_of", "warm_up"]
 
@@ -44,7 +44,7 @@ def material_seed(header: Header, material: str | None) -> int:
     return seed_of(header.seed, int.from_bytes(digest[:4])) if own else header.seed
 
 
-def warm_up(study: AnyStudy, seed: int, material: str | None = None) -> tuple[Block, dict[str, dict[str, float]]]:
+def warm_up(study: StudyFile, seed: int, material: str | None = None) -> tuple[Block, dict[str, dict[str, float]]]:
     """The warm-up: spread, feasible renderings from the seed, as many again for "another one"; and their sets."""
     from hilbo.search.rendering import Rendering  # with JAX, which nothing else here needs
     from hilbo.search.space import SearchSpace
@@ -59,7 +59,7 @@ def warm_up(study: AnyStudy, seed: int, material: str | None = None) -> tuple[Bl
 
 
 def header_for(
-    study: AnyStudy,
+    study: StudyFile,
     participant: str,
     session: str = "1",
     seed: int = 0,
@@ -80,7 +80,7 @@ def header_for(
 
 
 def header_of(
-    study: AnyStudy,
+    study: StudyFile,
     participant: str,
     session: str,
     seed: int,

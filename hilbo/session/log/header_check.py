@@ -5,7 +5,7 @@ import math
 from hilbo.errors import InputError
 from hilbo.session.log.records import Block, Header
 from hilbo.study.file.protocols import protocol
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.cell_text import check_id, check_text
 from hilbo.study.formats.json_file import check_values
 
@@ -20,12 +20,12 @@ _LABEL = 64  # characters of a session's label, and of an id
 _DAY = 86_400.0  # s
 
 
-def study_of(study: AnyStudy, material: str | None) -> AnyStudy:
+def study_of(study: StudyFile, material: str | None) -> StudyFile:
     """The study of one material; None for a study, or a session, without."""
     return study if material is None else study.material(material)
 
 
-def check_header(study: AnyStudy, header: Header) -> None:
+def check_header(study: StudyFile, header: Header) -> None:
     """Refuse a header that no session of this study can have, of whatever version. Raises InputError."""
     if header.schema not in _SCHEMAS:
         known = ", ".join(map(str, _SCHEMAS))
@@ -54,7 +54,7 @@ def check_label(label: str) -> None:
         )
 
 
-def check_new_header(study: AnyStudy, header: Header) -> None:
+def check_new_header(study: StudyFile, header: Header) -> None:
     """Refuse a header with which no session may begin: one that `check_header` refuses, or with an id or words against
     the rules for them. Raises InputError."""
     check_header(study, header)
@@ -68,7 +68,7 @@ def check_new_header(study: AnyStudy, header: Header) -> None:
             check_text(name, "the name of a set", f"block {number}")
 
 
-def _check_block(study: AnyStudy, header: Header, block: Block, place: str) -> None:
+def _check_block(study: StudyFile, header: Header, block: Block, place: str) -> None:
     if not 0 <= block.count <= _MOST or not 0 <= block.rest <= _DAY:
         raise InputError(f"{place} has {block.count} trials after {block.rest:g} s of rest, which is no session's.")
     here = study_of(study, block.material)

@@ -11,13 +11,13 @@ from collections.abc import Mapping
 
 from hilbo.session.log.header_check import SCHEMA
 from hilbo.session.log.records import RefusedError
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 
 __all__ = ["check_confirmed", "counted", "in_numbers", "in_words"]
 
 
 def check_confirmed(
-    study: AnyStudy, asked: Mapping[str, float], values: Mapping[str, float] | None, schema: int = SCHEMA
+    study: StudyFile, asked: Mapping[str, float], values: Mapping[str, float] | None, schema: int = SCHEMA
 ) -> None:
     """Refuse what is no confirmation of the values asked for (physical units, by name). `schema`: of the session's
     header. Raises RefusedError with the code "bad-answer" for what lacks a number, "off" for one that is too far off.
@@ -44,13 +44,13 @@ def check_confirmed(
             )
 
 
-def in_words(study: AnyStudy, values: Mapping[str, float]) -> dict[str, float | str]:
+def in_words(study: StudyFile, values: Mapping[str, float]) -> dict[str, float | str]:
     """Values as whoever presents is told them: levels by their names. What is no parameter, such as K0, stays."""
     parameters = {p.name: p for p in study.space.parameters}
     return {n: parameters[n].shown(v) if n in parameters and parameters[n].levels else v for n, v in values.items()}
 
 
-def in_numbers(study: AnyStudy, values: Mapping[str, float | str] | None) -> dict[str, float] | None:
+def in_numbers(study: StudyFile, values: Mapping[str, float | str] | None) -> dict[str, float] | None:
     """Confirmed values as the log holds them: of a level its place in the study's list. Raises RefusedError with the
     code "bad-answer" for a text that is none of the levels."""
     if values is None:
@@ -58,7 +58,7 @@ def in_numbers(study: AnyStudy, values: Mapping[str, float | str] | None) -> dic
     return {name: _number(study, name, value) for name, value in values.items()}
 
 
-def _number(study: AnyStudy, name: str, value: float | str) -> float:
+def _number(study: StudyFile, name: str, value: float | str) -> float:
     p = next((p for p in study.space.parameters if p.name == name), None)
     if p is None or not (p.levels or isinstance(value, str)):
         return math.nan if isinstance(value, str) else value
@@ -68,7 +68,7 @@ def _number(study: AnyStudy, name: str, value: float | str) -> float:
     return number
 
 
-def counted(study: AnyStudy, values: Mapping[str, float]) -> dict[str, float]:
+def counted(study: StudyFile, values: Mapping[str, float]) -> dict[str, float]:
     """The values that count for a confirmation that was accepted."""
     inside = {p.name: min(max(float(values[p.name]), p.low), p.high) for p in study.space.parameters}
     return {p.name: float(round(inside[p.name])) if p.discrete else inside[p.name] for p in study.space.parameters}

@@ -17,7 +17,7 @@ from hilbo.session.log.header_check import check_header, study_of
 from hilbo.session.log.records import Event, Header, Need
 from hilbo.session.log.state import LiveSession
 from hilbo.study.file.protocols import Ask, Show
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.json_file import check_values, converted
 
 __all__ = ["check_event", "replayed"]
@@ -133,7 +133,7 @@ _KINDS: dict[str, tuple[type, _Again]] = {
 }
 
 
-def replayed(study: AnyStudy, header: Header, events: Iterable[Event]) -> LiveSession:
+def replayed(study: StudyFile, header: Header, events: Iterable[Event]) -> LiveSession:
     """The state after a log's events, each of them checked. Raises InputError with the number of the event."""
     check_header(study, header)
     state = LiveSession.start(study, header)

@@ -22,7 +22,7 @@ from hilbo.errors import InputError
 from hilbo.session.log.records import Event, Header, Need, RefusedError, Trial
 from hilbo.session.log.transitions import APPLY, STOPS, stop_key
 from hilbo.study.file.protocols import protocol
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 
 __all__ = ["LiveSession", "Screen"]
 
@@ -33,7 +33,7 @@ Screen = Literal["wait", "trial", "ready", "rest", "paused", "done", "ended"]
 class LiveSession:
     """The state of a session; made by `start`, `after` and `fold`."""
 
-    study: AnyStudy = field(repr=False)
+    study: StudyFile = field(repr=False)
     header: Header
     seq: int = 0
     trials: tuple[Trial, ...] = ()
@@ -48,7 +48,7 @@ class LiveSession:
     last: float | None = None
 
     @classmethod
-    def start(cls, study: AnyStudy, header: Header) -> "LiveSession":
+    def start(cls, study: StudyFile, header: Header) -> "LiveSession":
         """A session before its first event. Raises InputError if the header belongs to another study."""
         if header.study != study.hash:
             raise InputError(
@@ -58,7 +58,7 @@ class LiveSession:
         return cls(study, header)
 
     @classmethod
-    def fold(cls, study: AnyStudy, header: Header, events: Iterable[Event]) -> "LiveSession":
+    def fold(cls, study: StudyFile, header: Header, events: Iterable[Event]) -> "LiveSession":
         """The state after these events."""
         state = cls.start(study, header)
         for event in events:

@@ -24,7 +24,7 @@ from hilbo.session.log.records import Block, Header, Planned
 from hilbo.session.plan.counterbalance import block_size, comparisons, orders
 from hilbo.session.plan.set_codes import OWN, Sets, coded, set_codes
 from hilbo.study.file.protocols import Phase, protocol
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.cell_text import but_for_case, check_id, check_text
 from hilbo.study.formats.json_file import converted, decoded, read_bytes
 
@@ -64,7 +64,7 @@ class _Plan(msgspec.Struct):
 
 
 def make_plan(
-    study: AnyStudy,
+    study: StudyFile,
     participants: Sequence[str],
     seed: int = 0,
     phase: Phase = "optimisation",
@@ -120,7 +120,7 @@ def plan_hash(plan: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def planned_header(plan: Mapping[str, Any], study: AnyStudy, participant: str, **others: Any) -> Header:
+def planned_header(plan: Mapping[str, Any], study: StudyFile, participant: str, **others: Any) -> Header:
     """The header of a planned session. Raises InputError if plan, study and participant do not belong together."""
     checked = check_plan(plan, study)
     rows = {row.participant: row.header for row in checked.participants}
@@ -144,7 +144,7 @@ def read_plan(path: str | os.PathLike) -> dict[str, Any]:
     return decoded(read_bytes(path), dict[str, Any], str(path), _WHAT)
 
 
-def check_plan(plan: Mapping[str, Any], study: AnyStudy) -> _Plan:
+def check_plan(plan: Mapping[str, Any], study: StudyFile) -> _Plan:
     """Refuse a plan that was changed after it was made, belongs to another study, or has sessions that cannot be.
 
     Raises `InputError`, with what to do.

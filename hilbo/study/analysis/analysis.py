@@ -135,7 +135,7 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
     ]
     if one:
         sentences.append(f"One answer only was ever given by {', '.join(one)}: that is no map of where to go.")
-    planned = study.selection.trials
+    planned = study.file.selection.trials
     if counts.max() < planned:
         sentences.append(f"The study plans {planned} trials; nobody has given more than {counts.max()}.")
     return tuple(sentences)

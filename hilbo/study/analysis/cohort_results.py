@@ -53,7 +53,7 @@ def analyse_cohort(
     if RULES[study.rule].learns:
         say("learning the hyperparameters from all answers")
     study = resolved(study, cohort)
-    say(f"fitting {len(cohort.names)} participants ({study.name})")
+    say(f"fitting {len(cohort.names)} participants ({study.file.name})")
 
     def first(optimum, map_):
         asked = asked_variance(map_, cohort)

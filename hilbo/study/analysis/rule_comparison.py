@@ -88,7 +88,7 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
         rules[rule] |= {"difference": difference, "difference_error": error}
     words = recommendation(left, rules, share, len(answered))
     if learns and cohort.contexts:
-        words += f" Only {recipe} takes account of the random effect of {study.random_effect}."
+        words += f" Only {recipe} takes account of the random effect of {study.file.random_effect}."
     content = {"share": share_content(share), "people": len(answered), "answers": int(cohort.counts().sum())}
     return content | {"rules": rules, "recommendation": words}
 

@@ -94,7 +94,7 @@ def effect_content(study: Study, cohort: Cohort, map_: RuleMap) -> dict[str, Any
     present = np.unique(np.asarray(trials.context)[np.asarray(trials.mask)])
     means, sds = np.asarray(effects.mean)[present], np.sqrt(np.asarray(effects.variance)[present])
     return {
-        "column": study.random_effect,
+        "column": study.file.random_effect,
         "variance": float(effects.prior),
         "levels": {
             cohort.contexts[c]: {"mean": mean, "sd": sd}

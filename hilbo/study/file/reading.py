@@ -13,148 +13,81 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import msgspec
 
 from hilbo.errors import InputError
-from hilbo.search.box import Box, Constraint, Mechanics, Parameter
+from hilbo.search.box import Box
 from hilbo.study.file.fields import enclosing, lines_of, prefix
 from hilbo.study.file.protocols import SessionTable
-from hilbo.study.file.schema import Selection, Tables
+from hilbo.study.file.schema import GPTable, ReportTable, Selection
+from hilbo.study.file.simulated_people import SimulationTable
 from hilbo.study.file.space_tables import box_of, check_together, of_material, read
 from hilbo.study.file.stimuli import StimulusTable
+from hilbo.study.file.trial_flags import TrialFlag
 
-__all__ = ["AnyStudy", "StudyFile", "checked", "hash_of", "made_of_material", "materials_in", "read_study"]
+__all__ = ["StudyFile", "checked", "read_study"]
 
 _T = TypeVar("_T")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StudyFile:
-    """What stands in a study file. `space` is the box of its parameters, of which a part may be passive."""
+    """The content of a study file. Two are equal if their content and their file are."""
 
-    tables: Tables
+    name: str
+    responses: tuple[str, ...]
+    """Labels, lowest first."""
+    attribute: str
+    """What is judged, in words: labels of axes."""
+    exclude: str
+    """The rule by which participants are left out (`hilbo.population.judged.response_quality`), empty for none."""
+    exclude_flags: tuple[TrialFlag, ...]
+    """Flags of the device for which an analysis leaves a trial out (`hilbo.study.file.trial_flags`)."""
     space: Box
+    """The ranges and constraints of the parameters; with mechanics only a part of it may be passive."""
+    gp: GPTable
+    rule: str
+    """The method that aggregates participants."""
+    selection: Selection
+    session: SessionTable
+    report: ReportTable
+    stimulus: StimulusTable | None
+    """How a program or a person presents the stimuli; None where a device does."""
+    simulation: SimulationTable | None
+    """The participants that `hilbo simulate` and `hilbo power` draw, if the file specifies them."""
+    random_effect: str | None
+    """The column of the trial table whose levels have an effect of their own, with a method that learns it."""
+    materials: tuple[str, ...]
+    """Names of the materials that override the renderer or the parameters."""
+    content: str
+    """The parsed file as JSON."""
     source: str
-    """The file that it came from."""
+    """The path of the file, empty if there is none."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, StudyFile) and (self.content, self.source) == (other.content, other.source)
+
+    def __hash__(self) -> int:
+        return hash((self.content, self.source))
 
     @staticmethod
     def load(path: str | os.PathLike) -> "StudyFile":
-        """Read and check a study file; InputError says in one sentence what is wrong with it, and where."""
+        """Read and check a study file. Raises `InputError`, one sentence with the place of the mistake."""
         return read_study(path, _itself)
 
-    @property
-    def name(self) -> str:
-        """The study's name."""
-        return self.tables.study.name
-
-    @property
-    def responses(self) -> tuple[str, ...]:
-        """The answers, lowest first."""
-        return self.tables.study.responses
-
-    @property
-    def random_effect(self) -> str | None:
-        """The column of the answers' table whose levels have an effect of their own."""
-        table = self.tables.random_effect
-        return None if table is None else table.column
-
-    @property
-    def exclude_flags(self) -> tuple[str, ...]:
-        """Flags of the device for which an analysis leaves a trial out."""
-        return self.tables.study.exclude_flags
-
-    @property
-    def selection(self) -> Selection:
-        """How trials are chosen."""
-        return self.tables.selection
-
-    @property
-    def session(self) -> SessionTable:
-        """What is said of live sessions."""
-        return self.tables.session
-
-    @property
-    def stimulus(self) -> StimulusTable | None:
-        """What is asked of the program that presents the renderings; None where a device does."""
-        return None if self.space.mechanics is not None else self.tables.stimulus or StimulusTable()
-
     @cached_property
-    def content(self) -> str:
-        """The parsed file as JSON."""
-        return json.dumps(msgspec.to_builtins(self.tables), ensure_ascii=False, separators=(",", ":"))
-
-    @property
     def hash(self) -> str:
-        """Identifies the content."""
-        return hash_of(self.content)
-
-    @property
-    def materials(self) -> tuple[str, ...]:
-        """Names of the materials that override the renderer or the parameters."""
-        return materials_in(self.content)
+        """First 16 hex digits of the SHA-256 of the content, without [simulation] and [random_effect]: they change
+        nothing that is asked of participants, whose sessions may be over."""
+        tables = json.loads(self.content)
+        hashed = {name: table for name, table in tables.items() if name not in ("simulation", "random_effect")}
+        return hashlib.sha256(_as_json(hashed).encode()).hexdigest()[:16]
 
     def material(self, name: str) -> "StudyFile":
-        """The file as it is for one material: its overrides of [renderer] and [parameters] applied."""
-        return made_of_material(self.content, self.source, name, _itself)
-
-
-@runtime_checkable
-class _AnySpace(Protocol):
-    """The names and ranges of a space: of a `Box`, or of the `SearchSpace` that is in it."""
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]: ...
-
-    @property
-    def mechanics(self) -> Mechanics | None: ...
-
-    @property
-    def constraints(self) -> tuple[Constraint, ...]: ...
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-
-    @property
-    def dim(self) -> int: ...
-
-
-@runtime_checkable
-class AnyStudy(Protocol):
-    """What plans, logs and tables need of a study: a `StudyFile`, or the `Study` that was made of it."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def responses(self) -> tuple[str, ...]: ...
-
-    @property
-    def space(self) -> _AnySpace: ...
-
-    @property
-    def random_effect(self) -> str | None: ...
-
-    @property
-    def exclude_flags(self) -> tuple[str, ...]: ...
-
-    @property
-    def selection(self) -> Selection: ...
-
-    @property
-    def session(self) -> SessionTable: ...
-
-    @property
-    def stimulus(self) -> StimulusTable | None: ...
-
-    @property
-    def hash(self) -> str: ...
-
-    @property
-    def materials(self) -> tuple[str, ...]: ...
-
-    def material(self, name: str) -> "AnyStudy": ...
+        """The file of one material: its overrides of [renderer] and [parameters] applied. Raises `InputError`."""
+        return _of_material(self, name)
 
 
 def read_study(path: str | os.PathLike, make: Callable[[StudyFile], _T]) -> _T:
@@ -195,29 +128,12 @@ def checked(raw: Mapping[str, Any], source: str, make: Callable[[StudyFile], _T]
     return whole
 
 
-@lru_cache(maxsize=64)
-def hash_of(content: str) -> str:
-    """First 16 hex digits of the SHA-256 of a study's content, without the people of its simulations and the column of
-    a random effect: they change nothing that is asked of people, whose sessions may be over."""
-    tables = json.loads(content)
-    hashed = {name: table for name, table in tables.items() if name not in ("simulation", "random_effect")}
-    if len(hashed) < len(tables):
-        content = json.dumps(hashed, ensure_ascii=False, separators=(",", ":"))
-    return hashlib.sha256(content.encode()).hexdigest()[:16]
-
-
-def materials_in(content: str) -> tuple[str, ...]:
-    """Names of the materials in a study's content."""
-    return tuple(json.loads(content).get("materials", {}))
-
-
 @lru_cache(maxsize=32)  # every event of a log may ask for its block's
-def made_of_material(content: str, source: str, name: str, make: Callable[[StudyFile], _T]) -> _T:
-    """What `make` makes of the study of one material, from the content of the whole one. Raises InputError."""
-    if name not in materials_in(content):
-        listed = ", ".join(materials_in(content)) or "there are none"
-        raise InputError(f"{prefix(source)}materials.{name} is not in the study, its materials: {listed}.")
-    return checked(of_material({"schema": 1} | json.loads(content), name), source, make)
+def _of_material(file: StudyFile, name: str) -> StudyFile:
+    if name not in file.materials:
+        listed = ", ".join(file.materials) or "there are none"
+        raise InputError(f"{prefix(file.source)}materials.{name} is not in the study, its materials: {listed}.")
+    return checked(of_material({"schema": 1} | json.loads(file.content), name), file.source, _itself)
 
 
 def _file(raw: Mapping[str, Any], source: str) -> StudyFile:
@@ -225,7 +141,25 @@ def _file(raw: Mapping[str, Any], source: str) -> StudyFile:
     tables = read(raw)
     box = box_of(tables)
     check_together(tables, box.parameters)
-    return StudyFile(tables, box, source)
+    return StudyFile(
+        **msgspec.structs.asdict(tables.study),
+        space=box,
+        gp=tables.gp,
+        rule=tables.aggregation.rule,
+        selection=tables.selection,
+        session=tables.session,
+        report=tables.report,
+        stimulus=None if tables.renderer is not None else tables.stimulus or StimulusTable(),
+        simulation=tables.simulation,
+        random_effect=None if tables.random_effect is None else tables.random_effect.column,
+        materials=tuple(tables.materials),
+        content=_as_json(msgspec.to_builtins(tables)),
+        source=source,
+    )
+
+
+def _as_json(tables: Mapping[str, Any]) -> str:
+    return json.dumps(tables, ensure_ascii=False, separators=(",", ":"))
 
 
 def _itself(file: StudyFile) -> StudyFile:

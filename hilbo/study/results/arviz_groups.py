@@ -63,11 +63,11 @@ def groups(
     names = ", ".join(f"{k} = {label}" for k, label in enumerate(study.responses))
     say = {"long_name": "answer", "categories": names}
     return {
-        "posterior": xr.Dataset({"f": (_DIMS, np.where(held, f, np.nan), {"long_name": study.attribute})}, chains),
+        "posterior": xr.Dataset({"f": (_DIMS, np.where(held, f, np.nan), {"long_name": study.file.attribute})}, chains),
         "posterior_predictive": xr.Dataset({"response": (_DIMS, np.where(held, response, -1), say)}, chains),
         "log_likelihood": _of_answers(log_likelihood, mask, cohort.names),
         "observed_data": xr.Dataset({"response": (_DIMS[2:], observed, say)}, coords),
-        "constant_data": xr.Dataset(constants, coords, {"study": study.hash, "inference": study.inference}),
+        "constant_data": xr.Dataset(constants, coords, {"study": study.file.hash, "inference": study.inference}),
     }
 
 

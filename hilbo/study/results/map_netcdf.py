@@ -51,11 +51,11 @@ def map_dataset(study: Study, surface: Callable[..., Any], cells: int = CELLS) -
     shape = x.shape[:-1]
     return xr.Dataset(
         {
-            "mean": (names, np.asarray(mean).reshape(shape), {"long_name": f"{study.attribute}, posterior mean"}),
+            "mean": (names, np.asarray(mean).reshape(shape), {"long_name": f"{study.file.attribute}, posterior mean"}),
             "variance": (
                 names,
                 np.asarray(variance).reshape(shape),
-                {"long_name": f"{study.attribute}, posterior variance"},
+                {"long_name": f"{study.file.attribute}, posterior variance"},
             ),
             "feasible": (
                 names,
@@ -64,7 +64,7 @@ def map_dataset(study: Study, surface: Callable[..., Any], cells: int = CELLS) -
             ),
         },
         coords={p.name: (p.name, p.to_physical(side), {"units": p.unit}) for p in shown},
-        attrs={"study": study.hash},
+        attrs={"study": study.file.hash},
     )
 
 
@@ -77,14 +77,14 @@ def _map_at_points(study: Study, surface: Callable[..., Any], seed: int = 0) -> 
         p.name: ("point", [p.shown(value) for value in values], {"units": p.unit})
         for p, values in zip(study.space.parameters, physical, strict=True)
     }
-    words = f"{study.attribute}, posterior"
+    words = f"{study.file.attribute}, posterior"
     return xr.Dataset(
         {
             "mean": ("point", mean, {"long_name": f"{words} mean"}),
             "variance": ("point", variance, {"long_name": f"{words} variance"}),
         },
         coords=columns,
-        attrs={"study": study.hash},
+        attrs={"study": study.file.hash},
     )
 
 

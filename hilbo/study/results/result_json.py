@@ -46,10 +46,10 @@ def read_result(path: str | os.PathLike, study: Study) -> Result:
     source, content = str(path), read_bytes(path)
     result: Result = decoded(content, Result, source, _WHAT)
     unsealed(content, result.digest, source)
-    if result.study != study.hash:
+    if result.study != study.file.hash:
         raise InputError(
-            f"{path}: is the result of another study ({result.study}, not {study.hash}); aggregate the answers again"
-            " with this study file."
+            f"{path}: is the result of another study ({result.study}, not {study.file.hash}); aggregate the answers"
+            " again with this study file."
         )
     if not result.participants:
         raise InputError(f"{path}: holds no participants; aggregate the answers again.")

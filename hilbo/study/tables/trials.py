@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError, warn_caller
-from hilbo.study.file.reading import AnyStudy
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES
 from hilbo.study.formats.cell_text import FORMULA_WORDS, ID_WORDS, but_for_case, check_text, formulas, no_ids
 from hilbo.study.formats.csv_file import (
@@ -46,7 +46,7 @@ __all__ = [
     "marked",
     "of_material",
     "ordered",
-    "read_trials",
+    "trial_table",
     "write_trials",
 ]
 
@@ -66,14 +66,14 @@ _MISSING = {"", "nan", "none", "<na>"}
 _FALSE = {"", "0", "0.0", "0,0", "false", "no", "nan", "none", "<na>"}
 
 
-def read_trials(
+def trial_table(
     path: str | os.PathLike,
-    study: AnyStudy,
+    study: StudyFile,
     material: str | None = None,
     *,
     others: bool = True,
     say: Callable[[int], None] = lambda rows: None,
-    note: Callable[[str], Any] = warn_caller,
+    note: Callable[[str], object] = warn_caller,
 ) -> pd.DataFrame:
     """The rows of a trial table that are to be fitted, in the order of their keys within each participant.
 
@@ -86,7 +86,7 @@ def read_trials(
     return _read(cell_pieces(path), study, material, str(path), others, say, note)
 
 
-def checked_trials(frame: pd.DataFrame, study: AnyStudy, material: str | None = None) -> pd.DataFrame:
+def checked_trials(frame: pd.DataFrame, study: StudyFile, material: str | None = None) -> pd.DataFrame:
     """As `read_trials`, from a table in memory: the same columns, the same checks. Raises `InputError` with the same
     sentences."""
     text = cells_of(frame)
@@ -98,7 +98,13 @@ def checked_trials(frame: pd.DataFrame, study: AnyStudy, material: str | None = 
 
 
 def _read(
-    whole: Iterable[pd.DataFrame], study: AnyStudy, material: str | None, source: str, others: bool, say: Any, note: Any
+    whole: Iterable[pd.DataFrame],
+    study: StudyFile,
+    material: str | None,
+    source: str,
+    others: bool,
+    say: Any,
+    note: Any,
 ) -> pd.DataFrame:
     texts, pieces, rows, named = {}, [], 0, {}
     for text in whole:
@@ -141,7 +147,7 @@ def ordered(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _note_the_absent(
-    left: pd.DataFrame, table: pd.DataFrame, source: str, besides: str, note: Callable[[str], Any]
+    left: pd.DataFrame, table: pd.DataFrame, source: str, besides: str, note: Callable[[str], object]
 ) -> None:
     """Say who has answers, and none that counts: without a word that person would be missing everywhere."""
     kept = set(table["participant"].unique())
@@ -154,14 +160,14 @@ def _note_the_absent(
         note(f"{source}: {answers} {also}; {who} {have} no other answer in it.")
 
 
-def marked(table: pd.DataFrame, study: AnyStudy) -> pd.DataFrame:
+def marked(table: pd.DataFrame, study: StudyFile) -> pd.DataFrame:
     """The table, marked as checked against this study. pandas carries the mark along; `is_checked` compares it with
     what then stands in the table."""
     table.attrs[_MARK] = _digest(table, study)
     return table
 
 
-def is_checked(table: pd.DataFrame, study: AnyStudy) -> bool:
+def is_checked(table: pd.DataFrame, study: StudyFile) -> bool:
     """Whether `read_trials` or `checked_trials` made the table for such a study, and nobody has changed it since."""
     try:
         return _MARK in table.attrs and table.attrs[_MARK] == _digest(table, study)
@@ -169,7 +175,7 @@ def is_checked(table: pd.DataFrame, study: AnyStudy) -> bool:
         return False
 
 
-def _digest(table: pd.DataFrame, study: AnyStudy) -> str:
+def _digest(table: pd.DataFrame, study: StudyFile) -> str:
     """Of what fits take from a table, its rows in their order, and of what the study asks of it."""
     columns = {*_KEY, "response", "category", "voided", "unblinded", study.random_effect, *study.space.names}
     held = table.loc[:, [column for column in table.columns if column in columns]]
@@ -179,7 +185,7 @@ def _digest(table: pd.DataFrame, study: AnyStudy) -> str:
     return hashlib.sha256(head.encode() + rows.tobytes()).hexdigest()
 
 
-def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
+def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
     """A piece with its numbers as numbers and its texts as one object each, and `_fitted`: which rows count."""
     numeric = {"trial", *study.space.names}
     table = pd.DataFrame(index=text.index)
@@ -221,7 +227,7 @@ def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:
         table.to_csv(path, index=False)  # pandas writes the shortest decimals that read back the same
 
 
-def _check_columns(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
+def _check_columns(text: pd.DataFrame, study: StudyFile, source: str) -> None:
     needed = ("participant", "trial", "response", *study.space.names)
     missing = [name for name in needed if name not in text.columns]
     if missing:
@@ -233,7 +239,7 @@ def _check_columns(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
         )
 
 
-def _check_random_effect(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
+def _check_random_effect(text: pd.DataFrame, study: StudyFile, source: str) -> None:
     """Refuse rows that leave the column of the study's random effect empty, where there is one."""
     name = study.random_effect
     if name in text.columns:
@@ -279,7 +285,7 @@ def flags(text: pd.DataFrame, column: str, source: str) -> pd.Series:
     return cells.isin(_TRUE)
 
 
-def _check_blinded(blinded: pd.Series, study: AnyStudy, source: str) -> None:
+def _check_blinded(blinded: pd.Series, study: StudyFile, source: str) -> None:
     """Refuse answers of people who knew the parameters beside answers of people who did not."""
     expected = study.stimulus is not None and study.stimulus.unblinded
     if not expected and blinded.any() and not blinded.all():
