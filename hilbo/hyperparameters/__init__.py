@@ -1,5 +1,4 @@
-"""Hyperparameters by maximum evidence: the evidence with gradient and Hessian, the coordinates of the search, and the
-search.
+"""Hyperparameters by maximum evidence: evidence with gradient and Hessian, coordinates of the search, and the search.
 
-Imports `ordinal_gp` and what that stands on.
+Imports `ordinal_gp` and its dependencies.
 """

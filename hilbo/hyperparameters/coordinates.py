@@ -1,5 +1,6 @@
-"""Hyperparameters as unconstrained coordinates: the logarithms of theta, variance and noise, the first threshold, the
-logarithms of the gaps between thresholds; and weak priors on them.
+"""Unconstrained coordinates of the hyperparameters, and weak priors on them.
+
+Logarithms of theta, variance and noise; the first threshold, and the logarithms of the gaps between thresholds.
 """
 
 from collections.abc import Sequence
@@ -16,13 +17,14 @@ Learnable = Literal["theta", "variance", "noise", "thresholds"]
 Coordinates = dict[str, Float[Array, "..."]]
 
 OF_THE_LIKELIHOOD = ("first", "gaps", "noise")
-"""Its coordinates; in a sorted record they come before the kernel's."""
+"""Coordinates of the likelihood; alphabetically they come before the kernel's."""
 
 _PRIOR_SD = {"theta": 1.5, "variance": 1.0, "noise": 1.0, "first": 1.0, "gaps": 1.0}
 _FIELDS = {"theta": ("theta",), "variance": ("variance",), "noise": ("noise",), "thresholds": ("first", "gaps")}
 
 
 def coordinates_of(gp: OrdinalGP, learn: Sequence[str]) -> Coordinates:
+    """Coordinates of a model's hyperparameters in `learn`, by name."""
     thresholds = gp.likelihood.thresholds
     every = {
         "theta": jnp.log(gp.kernel.theta),
@@ -35,7 +37,7 @@ def coordinates_of(gp: OrdinalGP, learn: Sequence[str]) -> Coordinates:
 
 
 def model_at(coordinates: Coordinates, gp: OrdinalGP) -> OrdinalGP:
-    """The model at these coordinates; what they do not mention is as in `gp`."""
+    """Model with the hyperparameters at these coordinates; the others are as in `gp`."""
     held = {"theta": gp.kernel.theta, "variance": gp.kernel.variance, "noise": gp.likelihood.noise}
     positive = held | {k: jnp.exp(coordinates[k]) for k in held if k in coordinates}
     thresholds = gp.likelihood.thresholds
@@ -47,7 +49,7 @@ def model_at(coordinates: Coordinates, gp: OrdinalGP) -> OrdinalGP:
 
 
 def log_prior(gp: OrdinalGP, centre: OrdinalGP, learn: Sequence[str]) -> Float[Array, ""]:
-    """Log density of the weak priors at `gp`, up to a constant; `centre` is where they are centred."""
+    """Log density of the weak priors at `gp`, up to a constant; `centre` is the model at their centre."""
     coordinates, centres = coordinates_of(gp, learn), coordinates_of(centre, learn)
     scale = dict.fromkeys(coordinates, 1.0) | {"first": jnp.sqrt(centre.kernel.variance)}
     squares = [jnp.sum(((coordinates[k] - centres[k]) / (_PRIOR_SD[k] * scale[k])) ** 2) for k in coordinates]

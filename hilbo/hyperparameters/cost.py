@@ -1,6 +1,6 @@
-"""What the search for hyperparameters minimises: the negative log evidence, per answer, with or without weak priors.
+"""Objective of the search for hyperparameters: negative log evidence per response, with or without weak priors.
 
-Given with gradient and Hessian: of Laplace's and EP's evidence in closed form, of corrected EP's by differentiation.
+With gradient and Hessian: in closed form for Laplace's and EP's evidence, by differentiation for corrected EP's.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ __all__ = ["Seen", "divisor", "evidence_cost", "person_ep_evidence", "person_evi
 
 
 class Seen(NamedTuple):
-    """The log evidence at some coordinates, whether it is certified, and where the posteriors were and are going."""
+    """Evaluation of the evidence: value, whether it is certified, coordinates, and starts for the next posteriors."""
 
     log_evidence: Float[Array, ""]
     certified: Bool[Array, ""]
@@ -37,8 +37,11 @@ class Seen(NamedTuple):
 def evidence_cost(
     gp: OrdinalGP, trials: Trials, learn: tuple[str, ...], weak_priors: bool, inference: str
 ) -> tuple[Callable[[Coordinates, Seen], Expansion], Seen]:
-    """The expansion of the cost of stacked `trials`, from coordinates and what was seen before, with what is seen
-    there; and what was seen at first: nothing."""
+    """Build the objective of stacked `trials`, and an empty evaluation.
+
+    The objective maps coordinates and the last evaluation to an expansion, which carries the new evaluation; the
+    posteriors are started from the last one.
+    """
     initial = ravel_pytree(coordinates_of(gp, learn))[0]
     zero = jnp.zeros((), initial.dtype)
     answers = divisor(trials)
@@ -52,27 +55,26 @@ def evidence_cost(
             value, gradient, hessian = value + prior.value, gradient + prior.gradient, hessian + prior.hessian
         return Expansion(-value / answers, -gradient / answers, -hessian / answers, seen)
 
-    place, moved = _unknown(trials, initial, inference)
+    place, moved = _no_starts(trials, initial, inference)
     return expand, Seen(zero, jnp.zeros((), bool), initial, place, moved)
 
 
 def divisor(trials: Trials) -> Float[Array, ""]:
-    """What the evidence is divided by: answers, so that curvatures are near 1 and the first step, which is down the
-    bare gradient, is a sensible one. One more, because there may be none."""
+    """Divisor of the evidence: number of responses + 1, which scales curvatures to about 1; never 0."""
     return jnp.sum(trials.mask, dtype=trials.x.dtype) + 1.0
 
 
-def _unknown(
+def _no_starts(
     trials: Trials, initial: Float[Array, " p"], inference: str
 ) -> tuple[PyTree[Float[Array, "M n"]], PyTree[Float[Array, "M n p"]]]:
-    """Where posteriors are before any was sought, and how they move: a start that is none."""
+    """Empty starting values of the posteriors and their derivatives."""
     none = jnp.zeros(trials.q.shape, initial.dtype)
     place = {"laplace": none, "ep": (none, none - jnp.inf)}.get(inference, ())
     return place, jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, initial.size), leaf.dtype), place)
 
 
 class _Summed(NamedTuple):
-    """The log evidence of all people with its derivatives, and what was seen on the way."""
+    """Log evidence summed over participants, with derivatives and the evaluation."""
 
     value: Float[Array, ""]
     gradient: Float[Array, " p"]
@@ -81,7 +83,7 @@ class _Summed(NamedTuple):
 
 
 def _differentiated(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordinates, last: Seen) -> _Summed:
-    """Value, gradient and Hessian of the summed evidence by automatic differentiation."""
+    """Expansion of the summed evidence by automatic differentiation."""
     del last
     flat, restore = ravel_pytree(coordinates)
 
@@ -98,7 +100,10 @@ def _differentiated(gp: OrdinalGP, trials: Trials, inference: str, coordinates: 
 
 
 def _closed(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordinates, last: Seen) -> _Summed:
-    """The same by closed derivatives; the posteriors are sought from where the last ones point."""
+    """Expansion of the summed evidence in closed form.
+
+    The posteriors are started from extrapolations of the last ones.
+    """
     expansion = {"laplace": person_evidence, "ep": person_ep_evidence}[inference]
     flat, _ = ravel_pytree(coordinates)
     step = flat - last.coordinates
@@ -115,9 +120,9 @@ def _closed(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordina
 
 @one_at_a_time
 def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: Float[Array, " n"]) -> Evidence:
-    """One person's evidence by Laplace's method, expanded in the coordinates, which are in alphabetical order.
+    """Laplace's log evidence of one participant, expanded in the coordinates (in alphabetical order).
 
-    `start`: weights near which the mode is sought.
+    `start`: weights from which the mode is searched.
     """
     return laplace_evidence(*_parts(gp, coordinates, trials, start.dtype, OrdinalTerms), start)
 
@@ -126,7 +131,7 @@ def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, sta
 def person_ep_evidence(
     gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: tuple[Float[Array, " n"], Float[Array, " n"]]
 ) -> Evidence:
-    """The same by expectation propagation; `start`: means and log variances of cavities, as in [`ep_evidence`][]."""
+    """EP's log evidence of one participant, expanded in the coordinates; `start` as for [`ep_evidence`][]."""
     return ep_evidence(*_parts(gp, coordinates, trials, start[0].dtype, TiltedTerms), start)
 
 

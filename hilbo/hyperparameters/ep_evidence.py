@@ -1,8 +1,8 @@
-"""Expectation propagation's log evidence as a function of a few hyperparameters: value, gradient, Hessian, closed.
+"""Log evidence of expectation propagation as a function of a few hyperparameters: value, gradient and Hessian.
 
-The covariance K and the terms L depend on p hyperparameters x. In the notation of `hilbo.inference.ep`, with C = (K +
-1/T)^-1, P = I - K C, S = P K and K_k = dK/dx_k, the evidence is stationary in the cavities (m, v), so that its gradient
-is
+In closed form. The covariance K and the terms L depend on p hyperparameters x. In the notation of `hilbo.inference.ep`,
+with C = (K + 1/T)^-1, P = I - K C, S = P K and K_k = dK/dx_k, the evidence is stationary in the cavities (m, v), so
+that its gradient is
 
     sum_i dL_i/dx_k at fixed cavities, + a'K_k a / 2 - tr(C K_k) / 2.
 
@@ -11,13 +11,13 @@ The Hessian is the gradient's derivative along the fixed point, whose cavities m
     m_j = W v_j + (1 + v t) [P (K_j a - v a_x) + S a_x],     J v_j = (1 + v t)^2 p_j - Q (dt/dm (1 + v t) [...] + t_x),
 
 a_x and t_x being the changes of slopes and precisions at fixed cavities, p_j = diag(P K_j P'), W, Q and J those of
-Newton's steps. With A_j and T_j the changes of a and t in all,
+Newton's steps. With A_j and T_j the total changes of a and t,
 
     sum_i [d2L_i/dx_k dx_j + a_x m_j + (a a_x - t_x / (2 (1 + v t)^2)) v_j]
     + a'K_k A_j - p_k'T_j / 2 + [a'K_kj a - tr(C K_kj) + tr(C K_k C K_j)] / 2;
 
-the bracket of v_j is d2L/dx dv, by the heat equation dL/dv = (a^2 + da/dm) / 2 with da/dm = -t / (1 + v t). The moved
-cavities are where the fixed point of the next hyperparameters is sought: three steps away instead of ten.
+the bracket of v_j is d2L/dx dv, by the heat equation dL/dv = (a^2 + da/dm) / 2 with da/dm = -t / (1 + v t). The
+extrapolated cavities are the start for the next hyperparameters: three steps instead of ten.
 """
 
 from collections.abc import Callable
@@ -43,15 +43,15 @@ def ep_evidence(
     shape: Float[Array, " k"],
     start: tuple[Float[Array, " n"], Float[Array, " n"]],
 ) -> Evidence:
-    """The expansion in x = (of_terms, shape): the terms depend on `of_terms`, the covariance on `shape`.
+    """Expansion of EP's log evidence in x = (of_terms, shape): terms depend on `of_terms`, the covariance on `shape`.
 
-    `start`: means and log variances of cavities near which the fixed point is sought, as is the result's `place`; where
-    that fails, or where a variance is none, it is sought anew. Logarithms, because moved along their derivatives they
-    save a quarter of the steps that variances take.
+    `start`: means and log variances of cavities from which the fixed point is searched, as in the result's `place`;
+    variances that are not positive mark no start. Extrapolating logarithms saves a quarter of the steps that variances
+    would take.
     """
     matrix, slopes = covariance(shape), jax.jacfwd(covariance)(shape)
     tilted = terms(of_terms)
-    settled = _settled(tilted, matrix, Cavities(start[0], jnp.exp(start[1])))
+    settled = _found_fixed_point(tilted, matrix, Cavities(start[0], jnp.exp(start[1])))
     (mean, variance), post = settled.cavities, settled.post
     values, weights, precision = tilted(mean, variance)
     moves = _moves(terms, of_terms, settled.cavities, post, slopes)
@@ -82,7 +82,7 @@ def ep_evidence(
 
 
 class _Attempt(NamedTuple):
-    """A fixed point, its posterior, and whether the residual was met."""
+    """Result of an attempt: fixed point, its posterior, whether the residual was met, and attempts left."""
 
     cavities: Cavities
     post: Conditioned
@@ -90,8 +90,8 @@ class _Attempt(NamedTuple):
     left: Int[Array, ""]  # attempts
 
 
-def _settled(terms: Tilted, matrix: Float[Array, "n n"], start: Cavities) -> _Attempt:
-    """The fixed point, in haste, or else once more without."""
+def _found_fixed_point(terms: Tilted, matrix: Float[Array, "n n"], start: Cavities) -> _Attempt:
+    """Find the fixed point in a `hasty` search, with a second, full search if its residual is not met."""
 
     def attempt(last: _Attempt) -> _Attempt:
         mean, variance, search = find(terms, matrix, last.cavities, _STEPS, last.left == 2)
@@ -111,7 +111,10 @@ def _settled(terms: Tilted, matrix: Float[Array, "n n"], start: Cavities) -> _At
 
 
 class _Moves(NamedTuple):
-    """How all moves with each hyperparameter, (n, p) each: m, v, A, T; at fixed cavities a_x and t_x; K_k a; p_k."""
+    """Derivatives by each hyperparameter, (n, p) each.
+
+    Those of m, v, a (A) and t (T); at fixed cavities a_x and t_x; K_k a; p_k.
+    """
 
     mean: Float[Array, "n p"]
     variance: Float[Array, "n p"]
@@ -130,7 +133,10 @@ def _moves(
     post: Conditioned,
     slopes: Float[Array, "n n k"],
 ) -> _Moves:
-    """`slopes`: dK/dx of the covariance's hyperparameters, which come after the terms' `of_terms`."""
+    """Derivatives of the fixed point by the hyperparameters.
+
+    `slopes`: dK/dx of the covariance's hyperparameters, which come after the terms' `of_terms`.
+    """
     mean, variance = cavities
     sites = sites_of(terms(of_terms), mean, variance)
     ratio = (1.0 + variance * sites.precision)[:, None]
@@ -159,7 +165,7 @@ def _moves(
 def _bilinear(
     weights: Float[Array, " n"], precision: Float[Array, " n"], variance: Float[Array, " n"], moves: _Moves
 ) -> Float[Array, "p p"]:
-    """Products of two first derivatives; symmetric but for rounding, which is shared out."""
+    """Part of the Hessian made of products of two first derivatives, symmetrised."""
     stretch = (1.0 + variance * precision)[:, None]
     by_variance = weights[:, None] * moves.slope_x - 0.5 * moves.precision_x / stretch**2
     by_terms = moves.slope_x.T @ moves.mean + by_variance.T @ moves.variance

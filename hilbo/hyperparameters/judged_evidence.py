@@ -1,10 +1,10 @@
-"""Maximum evidence that is not fooled by Laplace's method.
+"""Maximum evidence by Laplace's method, checked by expectation propagation.
 
-Laplace's evidence is too high where the noise is small against the latent function's spread, and its maximum may then
-lie where people's answers are predicted badly. Where a search by it ended, expectation propagation, which is within a
-hundredth of the exact evidence there, says by how much. Above `TRUSTED` an answer the hyperparameters are learnt again,
-by the evidence of expectation propagation. Reference: Kuss & Rasmussen (2005), JMLR 6:1679, on what both do at such
-hyperparameters.
+Laplace's evidence is too high where the noise is small relative to the spread of the latent function, and its maximum
+may then predict the responses badly. At the end of a search by Laplace's evidence its error is measured by expectation
+propagation, which is within a hundredth of the exact evidence there. If it exceeds `TRUSTED` per response, the
+hyperparameters are learnt again by the evidence of expectation propagation. Reference: Kuss & Rasmussen (2005), JMLR
+6:1679, on both methods at such hyperparameters.
 """
 
 from collections.abc import Sequence
@@ -22,17 +22,17 @@ from hilbo.ordinal_gp import OrdinalGP, Trials, fit
 __all__ = ["TRUSTED", "Judged", "judged_sentences", "maximise_judged"]
 
 TRUSTED = 0.05
-"""Nats an answer by which Laplace's evidence may differ from that of expectation propagation."""
+"""Largest accepted difference of Laplace's evidence from that of expectation propagation, nats per response."""
 
 
 class Judged(eqx.Module):
-    """What was learnt, and how far Laplace's evidence was off; leading axes as of `MaximumEvidence`."""
+    """Learnt hyperparameters and the error of Laplace's evidence; leading axes as of `MaximumEvidence`."""
 
     maximum: MaximumEvidence
     error: Float[Array, "*M"]
-    """Nats an answer, Laplace's less the other's, where the search by Laplace's evidence ended; 0 of other searches."""
+    """Laplace's minus EP's evidence at the end of the Laplace search, nats per response; 0 for other searches."""
     again: Bool[Array, "*M"]
-    """Learnt again, by expectation propagation."""
+    """Whether the hyperparameters were learnt again by expectation propagation."""
 
 
 def maximise_judged(
@@ -44,8 +44,11 @@ def maximise_judged(
     weak_priors: bool = True,
     inference: str = "laplace",
 ) -> Judged:
-    """Hyperparameters of stacked trials (M, n), the same for all, or (not `shared`) everybody's own; by `inference`'s
-    evidence, Laplace's judged. Not under `jit`: what is learnt again depends on what was learnt."""
+    """Learn hyperparameters of stacked trials (M, n) by maximum evidence, and check those by Laplace's method.
+
+    `shared`: the same for all participants, else individual ones; `inference`: method of the evidence. Not under `jit`:
+    what is learnt again depends on values.
+    """
     settings = (tuple(learn), shared, weak_priors)
     maximum = _learnt(gp, trials, *settings, inference)
     if inference != "laplace":
@@ -59,7 +62,7 @@ def maximise_judged(
 
 
 def judged_sentences(judged: Judged) -> list[str]:
-    """What must be said of hyperparameters that Laplace's evidence misjudged; nothing where it did not."""
+    """Messages about hyperparameters for which Laplace's evidence was inaccurate; empty if there are none."""
     again, error = np.atleast_1d(np.asarray(judged.again)), np.atleast_1d(np.asarray(judged.error))
     if not again.any():
         return []
@@ -71,6 +74,7 @@ def judged_sentences(judged: Judged) -> list[str]:
 
 
 def _like(flags: Bool[Array, "*M"], leaf: Array) -> Bool[Array, "..."]:
+    """Flags reshaped to broadcast against `leaf`."""
     return flags.reshape(*flags.shape, *(1,) * (leaf.ndim - flags.ndim))
 
 
@@ -78,6 +82,7 @@ def _like(flags: Bool[Array, "*M"], leaf: Array) -> Bool[Array, "..."]:
 def _learnt(
     gp: OrdinalGP, trials: Trials, learn: tuple[str, ...], shared: bool, weak_priors: bool, inference: str
 ) -> MaximumEvidence:
+    """Maximum-evidence hyperparameters, shared or one participant after the other."""
     if shared:
         return maximise_shared_evidence(gp, trials, learn, weak_priors=weak_priors, inference=inference)
     return jax.lax.map(lambda t: maximise_evidence(gp, t, learn, weak_priors=weak_priors, inference=inference), trials)
@@ -85,7 +90,7 @@ def _learnt(
 
 @program
 def _error(maximum: MaximumEvidence, trials: Trials, shared: bool) -> Float[Array, "*M"]:
-    """Laplace's log evidence less that of expectation propagation, an answer: of all, or (not `shared`) of each."""
+    """Laplace's minus EP's log evidence per response: of all participants together if `shared`, else of each."""
 
     def by_ep(gp, trials):
         return fit(gp, trials, inference="ep", throw=False).log_evidence
@@ -95,4 +100,4 @@ def _error(maximum: MaximumEvidence, trials: Trials, shared: bool) -> Float[Arra
         together = jnp.sum(jax.lax.map(lambda t: by_ep(maximum.gp, t), trials))
         return (maximum.log_evidence - together) / jnp.sum(counts)
     errors = maximum.log_evidence - jax.lax.map(lambda pair: by_ep(*pair), (maximum.gp, trials))
-    return jnp.where(counts > 0, errors / jnp.where(counts > 0, counts, 1.0), 0.0)  # no answers, nothing to err in
+    return jnp.where(counts > 0, errors / jnp.where(counts > 0, counts, 1.0), 0.0)  # no responses, no error

@@ -5,21 +5,21 @@ evidence is the value at a = g(eta; x), g the terms' slopes and W their curvatur
 
     G(a, x) = sum l - a'K a / 2 - log|I + K W| / 2.
 
-Its Hessian is that of G + mu'(g - a) along the line a + A dx, A = da/dx, where the adjoint mu stands for how the
-weights bend. With S = (K^-1 + W)^-1, C = (K + 1/W)^-1, T = I - C K, s = diag(S), and for each hyperparameter
-K_i = dK/dx_i,
+Its Hessian is that of G + mu'(g - a) along the line a + A dx, A = da/dx, where the adjoint mu accounts for the
+curvature of the weights. With S = (K^-1 + W)^-1, C = (K + 1/W)^-1, T = I - C K, s = diag(S), and for each
+hyperparameter K_i = dK/dx_i,
 
     lambda = -T (s dW/deta) / 2,   mu = K lambda,   m_i = T'(K_i a + K dg/dx_i),   A_i = dg/dx_i - W m_i,
     w_i = dW/dx_i + (dW/deta) m_i,   t_i = diag(T'K_i T),
 
-the second derivatives are those of <K(x), Q>, Q = a a'/2 + lambda a' - C/2, and of sum (l - s W / 2 + mu g) along
-eta + m dx, plus
+the second derivatives are those of <K(x), Q>, Q = a a'/2 + lambda a' - C/2, and of sum (l - s W / 2 + mu g) along eta +
+m dx, plus
 
     lambda'(K_i A_j + K_j A_i) - A_i'K A_j + [tr(C K_i C K_j) - t_i'w_j - t_j'w_i + w_i'(S o S) w_j] / 2.
 
-That takes four products of matrices, and two for each hyperparameter of the covariance; automatic differentiation takes
-five times as long. The weights and A say where the mode of the next hyperparameters is: two or three steps away instead
-of ten. Reference: Rasmussen & Williams (2006), section 5.5.1, for the gradient.
+This takes four products of matrices, and two for each hyperparameter of the covariance; automatic differentiation takes
+five times as long. The weights and A give the start for the mode at the next hyperparameters: two or three steps
+instead of ten. Reference: Rasmussen & Williams (2006), section 5.5.1, for the gradient.
 """
 
 from collections.abc import Callable
@@ -40,20 +40,20 @@ _STEPS = 200
 
 
 class Evidence(NamedTuple):
-    """Log evidence in p hyperparameters x, its derivatives, and where it was found."""
+    """Log evidence in p hyperparameters x, its derivatives, and the posterior at which it was computed."""
 
     value: Float[Array, ""]
     gradient: Float[Array, " p"]
     hessian: Float[Array, "p p"]
     place: PyTree[Float[Array, " n"]]
-    """Laplace's weights, or means and log variances of EP's cavities; the next ones are sought near them."""
+    """Laplace's weights, or means and log variances of EP's cavities; start for the next hyperparameters."""
     moved: PyTree[Float[Array, "n p"]]
     """Derivatives of `place`."""
     certified: Bool[Array, ""]
 
 
 class Conditioned(NamedTuple):
-    """A prior K after answers with curvatures W: what is left of it, and what explains the rest."""
+    """Prior K conditioned on observations with curvatures W: C, T, S, diag(S) and log|I + KW|."""
 
     inverse: Float[Array, "n n"]  # C
     transfer: Float[Array, "n n"]  # T
@@ -63,7 +63,7 @@ class Conditioned(NamedTuple):
 
 
 def conditioned(matrix: Float[Array, "n n"], curvature: Float[Array, " n"]) -> Conditioned:
-    """C = (K + 1/W)^-1, T = I - C K, S = (K^-1 + W)^-1 with its diagonal, and log|I + KW|."""
+    """Compute C = (K + 1/W)^-1, T = I - C K, S = (K^-1 + W)^-1 with its diagonal, and log|I + KW|."""
     root, _, lower = factorise(matrix, curvature)
     factor = solve_lower(lower, jnp.diag(root))
     through = factor @ matrix
@@ -80,7 +80,10 @@ def certified(
     post: Conditioned,
     curvature_at: Callable[[Float[Array, " n"]], Float[Array, " n"]],
 ) -> Bool[Array, ""]:
-    """Whether the evidence is known and no variance is below its rounding; `at_mode`: mode, weights and curvatures."""
+    """Whether the evidence is accurate and no variance is below its rounding error.
+
+    `at_mode`: mode, weights, curvatures.
+    """
     eta, weights, curvature = at_mode
     largest = jnp.max(jnp.diagonal(matrix))
     smallest = jnp.min(jnp.where(curvature > 0, post.variance, largest))
@@ -97,9 +100,9 @@ def laplace_evidence(
     shape: Float[Array, " k"],
     start: Float[Array, " n"],
 ) -> Evidence:
-    """The expansion in x = (of_terms, shape): the terms depend on `of_terms`, the covariance on `shape`.
+    """Expansion of Laplace's log evidence in x = (of_terms, shape): terms depend on `of_terms`, covariance on `shape`.
 
-    `start`: weights near which the mode is sought; where that fails it is sought anew.
+    `start`: weights from which the mode is searched; if that fails it is searched from 0.
     """
     matrix, slopes = covariance(shape), jax.jacfwd(covariance)(shape)
     pointwise = terms(of_terms)
@@ -131,7 +134,7 @@ def laplace_evidence(
 
 
 class _Paths(NamedTuple):
-    """How everything moves with each hyperparameter: m, A and w, (n, p) each; and lambda."""
+    """Derivatives by each hyperparameter: m, A and w, (n, p) each; and lambda."""
 
     mean: Float[Array, "n p"]
     weights: Float[Array, "n p"]
@@ -147,7 +150,10 @@ def _paths(
     slopes: Float[Array, "n n k"],
     posterior: tuple[Float[Array, "n n"], Float[Array, " n"], Float[Array, " n"]],
 ) -> _Paths:
-    """`slopes`: dK/dx of the covariance's hyperparameters; `posterior`: K, weights and curvatures at the mode."""
+    """Derivatives of mode, weights and curvatures by the hyperparameters, and the adjoint.
+
+    `slopes`: dK/dx of the covariance's hyperparameters; `posterior`: K, weights and curvatures at the mode.
+    """
     matrix, weights, curvature = posterior
 
     def nearby(of_terms, shift):
@@ -171,7 +177,7 @@ def _paths(
 def _bilinear(
     matrix: Float[Array, "n n"], post: Conditioned, slopes: Float[Array, "n n k"], paths: _Paths
 ) -> Float[Array, "p p"]:
-    """What is left of the Hessian: products of two first derivatives."""
+    """Part of the Hessian made of products of two first derivatives."""
     terms_count, count = paths.mean.shape[1] - slopes.shape[2], slopes.shape[2]
     through = [post.inverse @ slopes[:, :, k] for k in range(count)]
     narrowed = [jnp.sum(post.transfer * (slopes[:, :, k] @ post.transfer), axis=0) for k in range(count)]

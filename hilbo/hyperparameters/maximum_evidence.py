@@ -1,20 +1,21 @@
-"""Hyperparameters by maximum evidence, alone or with weak priors, for one participant or shared by all.
+"""Hyperparameters by maximum evidence, with or without weak priors, for one participant or shared by all.
 
 Unconstrained coordinates: log theta, log variance, log noise, the first threshold and the logs of the gaps between
-thresholds, so that learnt thresholds stay ordered. What is not learnt keeps the model's value. Two freedoms of the
-model have to be fixed: its scale (f, thresholds and noise times s, variance times s^2, give the same answers), by not
-learning all of variance, noise and thresholds together; and its shift, which the prior's mean 0 fixes.
+thresholds, so that learnt thresholds stay ordered. Hyperparameters that are not learnt keep the model's values. Two
+invariances of the model have to be removed: its scale (f, thresholds and noise times s, variance times s^2, give the
+same probabilities), by not learning all of variance, noise and thresholds together; and its shift, which the prior's
+mean 0 fixes.
 
 Weak priors, centred at the model's own values: log theta sd 1.5, log variance, log noise and log gaps sd 1, first
-threshold sd 1 in units of the prior's standard deviation. Few ordinal answers often leave the evidence without a
-maximum (theta to 0 or infinity); the result then says so instead of printing digits.
+threshold sd 1 in units of the prior's standard deviation. With few ordinal responses the evidence often has no maximum
+(theta to 0 or infinity); the result then reports that (`runaway`).
 
-The search is Newton's method with a trust radius, which takes 6 to 20 steps, a quasi-Newton one 30 to 100.
-The evidences by Laplace's method and by EP have gradients and Hessians in closed form
-(`hilbo.hyperparameters.laplace_evidence`, `hilbo.hyperparameters.ep_evidence`), and modes and cavities are sought from
-where the last ones point; the evidence by corrected EP is differentiated automatically. Of several starts, those that
-go where an earlier one ended stop there. Reference: Rasmussen & Williams (2006), section 5.5.1; paper, section IV-3
-(robustness check).
+The search is Newton's method with a trust region, which takes 6 to 20 steps, a quasi-Newton one 30 to 100. The
+evidences by Laplace's method and by EP have gradients and Hessians in closed form
+(`hilbo.hyperparameters.laplace_evidence`, `hilbo.hyperparameters.ep_evidence`), and modes and cavities are started from
+extrapolations of the last ones; the evidence by corrected EP is differentiated automatically. Of several starts, those
+that approach the end of an earlier one stop there. Reference: Rasmussen & Williams (2006), section 5.5.1; paper,
+section IV-3 (robustness check).
 """
 
 from collections.abc import Callable, Sequence
@@ -38,20 +39,22 @@ from hilbo.ordinal_gp import OrdinalGP, Trials
 
 __all__ = ["MaximumEvidence", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
 
-_RUNAWAY = 6.9  # a factor of 1000: that far from where the search began there is no maximum to speak of
+_RUNAWAY = 6.9  # a factor of 1000: largest change of a hyperparameter that counts as a maximum
 _AT_A_WALL = 1e-6  # of a coordinate's range
-_FLAT = 1e-3  # curvature of the log evidence: less leaves a hyperparameter open by a factor exp(30) either way
+_FLAT = (
+    1e-3  # curvature of the log evidence below which a hyperparameter is undetermined by a factor exp(30) either way
+)
 
 
 class MaximumEvidence(eqx.Module):
-    """A model with learnt hyperparameters, and how the search for it ended; leading axes for several people."""
+    """Model with learnt hyperparameters, and the outcome of the search; leading axes for several participants."""
 
     gp: OrdinalGP
     log_evidence: Float[Array, "*M"]
-    """Of the answers, without the prior's part."""
+    """Log evidence of the responses, without the weak priors."""
     steps: Int[Array, "*M"]
     converged: Bool[Array, "*M"]
-    """The gradient vanished, and every fit on the way to it held its certificate at the end."""
+    """The gradient vanished, and the fits at the end are certified."""
     runaway: Bool[Array, "*M"]
     """A hyperparameter moved by more than a factor 1000, or may move by more than exp(30) at no cost: the evidence has
     no maximum in reach."""
@@ -76,17 +79,20 @@ def maximise_evidence(
     max_steps: int = 100,
     inference: str = "laplace",
 ) -> MaximumEvidence:
-    """The hyperparameters under which one person's answers are most probable; under `jax.vmap`, each person's own.
+    """Hyperparameters that maximise the evidence of one participant's responses.
+
+    Use `jax.vmap` for individual ones of several.
 
     **Arguments:**
 
-    - `gp`: starting values, and the values of what is not learnt.
+    - `gp`: starting values, and the values of hyperparameters that are not learnt.
     - `learn`: which of "theta", "variance", "noise", "thresholds". A `theta` of shape (d,) is learnt per dimension.
     - `weak_priors`: add the log prior above.
-    - `inference`: whose evidence, "laplace", "ep" or "ep_corrected"; "exact" has no derivatives.
-    - `starts`: the search begins at the model's values with theta and noise scaled by powers of 2; the best end wins.
+    - `inference`: method of the evidence, "laplace", "ep" or "ep_corrected"; "exact" has no derivatives.
+    - `starts`: number of searches, from the model's values with theta and noise scaled by powers of 2; the best one
+      wins.
 
-    Raises `InputError` for names in `learn` that are not learnt, and for an inference without derivatives.
+    Raises `InputError` for unknown names in `learn`, and for an inference without derivatives.
     """
     options = _Options(_checked(learn, inference), weak_priors, starts, max_steps, inference)
     return _maximise(gp, jax.tree.map(lambda leaf: leaf[None], trials), options)
@@ -104,13 +110,13 @@ def maximise_shared_evidence(
 ) -> MaximumEvidence:
     """One set of hyperparameters for all participants (`trials` stacked): maximises the sum of their log evidences.
 
-    Arguments as those of [`maximise_evidence`][], and it raises the same errors.
+    Arguments and errors as for [`maximise_evidence`][].
     """
     return _maximise(gp, trials, _Options(_checked(learn, inference), weak_priors, starts, max_steps, inference))
 
 
 class _Options(NamedTuple):
-    """The search's options, which are static: see `maximise_evidence`."""
+    """Options of the search; static."""
 
     learn: tuple[str, ...]
     weak_priors: bool
@@ -120,16 +126,19 @@ class _Options(NamedTuple):
 
 
 def _maximise(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence:
-    """The search, person by person on a CPU: each stops when it is done, where a batch would wait for its slowest."""
+    """Check the options, then search.
+
+    Participant by participant on a CPU, each search stopping when it has converged.
+    """
     return one_at_a_time(lambda gp, trials: _search(gp, trials, options))(gp, trials)
 
 
 def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence:
-    """The best end of searches from several starts; `trials` are stacked."""
+    """Search from several starts and return the best result; `trials` are stacked."""
     expand, nothing = evidence_cost(gp, trials, options.learn, options.weak_priors, options.inference)
 
     def cost(coordinates, _):
-        """The search asks this for shapes alone."""
+        """Value of the expansion; only its shape is used."""
         expansion = expand(coordinates, nothing)
         return expansion.value, expansion.aux
 
@@ -145,7 +154,7 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence
             throw=False,
             options={"expand": expand, "begun": first, "known": earlier_ends},
         )
-        # An evidence without its certificate is no evidence: such an end never wins. Nor one that is known already.
+        # Ends without a certificate, and ends that an earlier search has reached, cannot win.
         end, joined = solution.state.here, arrives(solution.value, solution.state.move, earlier_ends)
         certified = end.aux.certified
         value = jnp.where(certified & jnp.isfinite(end.value) & ~joined, end.value, jnp.inf)
@@ -157,7 +166,7 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence
         return (ends, first.aux), _End(solution.value, value, end.aux.log_evidence, steps, done, flat)
 
     initial = coordinates_of(gp, options.learn)
-    # One search after the other: each stops when it is done, or on its way to where an earlier one ended; and its first
+    # One search after the other: each stops when converged or near the end of an earlier one; its first evaluation
     # evidence is sought from the one before's.
     no_ends = jnp.full((options.starts, nothing.coordinates.size), jnp.nan, nothing.coordinates.dtype)
     _, ends = jax.lax.scan(ended, (no_ends, nothing), _spread(initial, options.starts))
@@ -169,7 +178,7 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence
 
 
 class _End(NamedTuple):
-    """Where a search ended; `value` is infinite where it does not count."""
+    """End of one search; `value` is infinite if it cannot win."""
 
     coordinates: Coordinates
     value: Float[Array, ""]
@@ -180,20 +189,22 @@ class _End(NamedTuple):
 
 
 def _best(ends: _End, starts: int) -> _End:
-    """The best of stacked ends. The search from the model itself wins a tie: where there are no answers, and where no
-    search ended well."""
+    """Best of the stacked ends.
+
+    In a tie the search from the model itself wins, as without responses or certified ends.
+    """
     model_first = (jnp.arange(starts) + _row_of_model(starts)) % starts
     best = model_first[jnp.argmin(ends.value[model_first])]
     return jax.tree.map(lambda leaf: leaf[best], ends)
 
 
 def _flat(end: Expansion, trials: Trials) -> Bool[Array, ""]:
-    """Whether the evidence leaves some hyperparameter open: its smallest curvature says so."""
+    """Whether some hyperparameter is undetermined: the smallest curvature of the log evidence is below `_FLAT`."""
     return eigh(end.hessian)[0][0] * divisor(trials) < _FLAT
 
 
 def _checked(learn: Sequence[str], inference: str) -> tuple[str, ...]:
-    """The names to learn. Raises `InputError` for unknown ones, for all three scales, and without derivatives."""
+    """Return `learn` as a tuple. Raises `InputError` for unknown names and for a scale that is not determined."""
     learn = tuple(learn)
     unknown = [name for name in learn if name not in get_args(Learnable)]
     if unknown or not learn:
@@ -212,12 +223,12 @@ def _checked(learn: Sequence[str], inference: str) -> tuple[str, ...]:
 
 
 def _row_of_model(starts: int) -> int:
-    """Which of the starting points is the model itself."""
+    """Index of the starting point that is the model itself."""
     return (starts - 1) // 2
 
 
 def _spread(initial: Coordinates, starts: int) -> Coordinates:
-    """Starting points in a row: theta (and noise, the other way) by rising powers of 2, the model itself amid them."""
+    """Starting points: theta times rising powers of 4, noise times powers of 1/2, the model itself in the middle."""
     power = (jnp.arange(starts) - _row_of_model(starts)).astype(initial[next(iter(initial))].dtype)
     step = {"theta": 1.4, "noise": -0.7}  # 4 and 1/2, as logarithms
     return {
@@ -237,14 +248,14 @@ def optimum_sensitivity(
     walls: Polytope | None = None,
     held: Bool[Array, " d"] | None = None,
 ) -> Coordinates:
-    """How an optimum moves with the hyperparameters: d x / d(coordinate), (d, ...) in units of the search ranges.
+    """Derivative of an optimum by the hyperparameters: d x / d(coordinate), (d, ...) in units of the search ranges.
 
     At a maximum the gradient along free directions is 0, so that by the implicit function theorem dw = -H^-1
-    d(gradient) there; what lies at a wall stays in it. Positive hyperparameters are on a log scale.
+    d(gradient) there; directions across an active wall stay fixed. Positive hyperparameters are on a log scale.
 
     **Arguments:** `height` of the map at box coordinates, given what `refit` makes of a model; its maximum `w`; the
-    model; and `from_box`, to the unit cube. `walls`: those between which the maximum is sought, beside the cube's;
-    `held`: coordinates that have steps, which a small change does not move.
+    model; and `from_box`, to the unit cube. `walls`: constraints of the maximum in addition to the cube's; `held`:
+    coordinates with discrete steps, which a small change does not move.
     """
     coordinates = coordinates_of(gp, learn)
     # Forward over forward: forward over reverse drops custom derivative rules inside a scan (docs/design.md).
@@ -264,7 +275,7 @@ def optimum_sensitivity(
 def _free_directions(
     w: Float[Array, " d"], walls: Polytope | None, held: Bool[Array, " d"] | None
 ) -> Float[Array, "d d"]:
-    """The projection onto the directions in which a maximum may move: along the walls that it lies at."""
+    """Projection onto the directions in which a maximum may move: those along its active walls."""
     inside = (w > _AT_A_WALL) & (w < 1.0 - _AT_A_WALL)
     if walls is None:
         return jnp.diag(inside.astype(w.dtype))

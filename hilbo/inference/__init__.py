@@ -1,5 +1,4 @@
-"""Approximations of the posterior of latent values beside Laplace's: expectation propagation, its corrected form, and
-the exact posterior by sampling.
+"""Approximations of the posterior besides Laplace's: expectation propagation, its corrected form, and exact sampling.
 
-Imports `laplace`, `gaussian` and `numerics`; knows no likelihood but through its terms.
+Imports `laplace`, `gaussian` and `numerics`; depends on a likelihood only through its terms.
 """

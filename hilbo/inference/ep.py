@@ -39,7 +39,7 @@ from hilbo.inference.ep_search import Found, find
 from hilbo.inference.ep_sites import Joint, Sites, Tilted, coupling, joint_of, sites_of
 from hilbo.numerics.linalg import one_at_a_time
 
-__all__ = ["ep", "fixed_point", "gaussian", "inverse_of", "settled"]
+__all__ = ["ep", "fixed_point", "gaussian", "inverse_of", "joint_at"]
 
 
 def ep(
@@ -49,19 +49,19 @@ def ep(
     start: Float[Array, " n"] | None = None,
     max_steps: int = 200,
 ) -> GaussianPosterior:
-    """Approximate p(eta | data) by the Gaussian that matches the tilted moments.
+    """Approximate p(eta | data) by the Gaussian that matches the tilted moments (expectation propagation).
 
     **Arguments:**
 
     - `covariance`: K, (n, n), symmetric, positive semi-definite. Terms that always return 0 (padding) change nothing.
-    - `terms`: cavity means and variances (n,) -> L, slopes and precisions, (n,) each; a pytree (an `eqx.Module`, say)
+    - `terms`: cavity means and variances (n,) -> L, slopes and precisions, (n,) each; a pytree (e.g. an `eqx.Module`)
       if it holds arrays that are traced.
     - `start`: `weights` of an earlier, similar fit (also Laplace's); changes the number of steps, not the result.
 
     **Returns:** the posterior in the record of [`laplace`][hilbo.laplace.laplace]: `mode` is its mean, `weights` are
-    the slopes a. Differentiable in `covariance` and in the arrays of `terms`. Never raises: read
+    the slopes a. Differentiable in `covariance` and in the arrays of `terms`. Never raises: check
     `certificate.converged`. In the certificate, `residual` is the largest mismatch of a mean, in prior standard
-    deviations, or of a log variance, whichever is the worse beside its tolerance.
+    deviations, or of a log variance, whichever is larger relative to its tolerance.
     """
     return gaussian(terms, covariance, *fixed_point(terms, covariance, start, max_steps))
 
@@ -73,20 +73,20 @@ def gaussian(
     variance: Float[Array, " n"],
     cavities: Found,
 ) -> GaussianPosterior:
-    """The posterior that belongs to the cavities `fixed_point` ended at."""
+    """Posterior and certificate for the cavities at which `fixed_point` ended."""
     _, slope, precision = terms(mean, variance)
     inverse, _ = inverse_and_log_determinant(covariance, precision)
     log_evidence = _log_evidence(terms, covariance, mean, variance)
     fixed = jax.lax.stop_gradient((covariance, precision))
     root, condition = factor(*fixed)
-    terms, (middle, cavity, weights) = still(terms), jax.lax.stop_gradient((mean, variance, slope))
+    terms, (fixed_mean, fixed_variance, weights) = still(terms), jax.lax.stop_gradient((mean, variance, slope))
     certificate = certify(
         fixed[0],
-        middle + cavity * weights,
+        fixed_mean + fixed_variance * weights,
         weights,
         fixed[1],
         root,
-        lambda eta: terms(eta - cavity * weights, cavity)[2],
+        lambda eta: terms(eta - fixed_variance * weights, fixed_variance)[2],
         jax.lax.stop_gradient(log_evidence),
         residual=cavities.residual,
         tolerance=cavities.tolerance,
@@ -104,7 +104,7 @@ def gaussian(
 def fixed_point(
     terms: Tilted, covariance: Float[Array, "n n"], start: Float[Array, " n"] | None, max_steps: int
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Found]:
-    """Cavity means and variances, and how they were found."""
+    """Cavity means and variances at the fixed point, and the record of the search."""
     return find(terms, covariance, start, max_steps)
 
 
@@ -112,7 +112,7 @@ def fixed_point(
 def _joint(
     covariance: Float[Array, "n n"], precision: Float[Array, " n"], root: Float[Array, "n n"]
 ) -> Float[Array, "n n"]:
-    """S from the root R of K, without the difference K - K C K; its derivative needs none of R's."""
+    """S from the root R of K, without the cancellation in K - K C K; its derivative rule does not need that of R."""
     return joint_of(covariance, root, precision).covariance
 
 
@@ -126,10 +126,10 @@ def _joint_jvp(
     return joint, transfer @ tangents[0] @ transfer.T - (joint * tangents[1][None, :]) @ joint
 
 
-def settled(
+def joint_at(
     covariance: Float[Array, "n n"], sites: Sites, variance: Float[Array, " n"]
 ) -> tuple[Joint, Float[Array, "n n"]]:
-    """At the fixed point, written so that it can be differentiated: S and its kin, and I - S T."""
+    """Joint posterior S at the fixed point in differentiable form, and the transfer matrix I - S T."""
     root, _ = square_root(jax.lax.stop_gradient(covariance))
     joint = _joint(covariance, sites.precision, root)
     transfer = jnp.eye(variance.shape[0], dtype=variance.dtype) - joint * sites.precision[None, :]
@@ -139,6 +139,7 @@ def settled(
 @jax.custom_jvp
 @one_at_a_time
 def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Matrix inverse with an explicit derivative rule."""
     return jnp.linalg.inv(matrix)
 
 
@@ -146,22 +147,25 @@ def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def _inverse_of_jvp(
     primals: tuple[Array, ...], tangents: tuple[Array, ...]
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+    """Derivative of the inverse: -A⁻¹ dA A⁻¹."""
     inverse = inverse_of(*primals)
     return inverse, -inverse @ tangents[0] @ inverse
 
 
 @fixed_point.def_jvp
 def _fixed_point_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-    """Both conditions differentiated: with P = I - K C = I - S T,
+    """Derivative of the fixed point by the implicit function theorem.
 
-    dm = W dv + (1 + v t) [P (dK a - v da) + S da],    J dv = diag(P dK P') / left^2 - Q (dt/dm (dm - W dv) + dt),
+    With P = I - K C = I - S T both matching conditions give
+
+        dm = W dv + (1 + v t) [P (dK a - v da) + S da],    J dv = diag(P dK P') / left^2 - Q (dt/dm (dm - W dv) + dt),
 
     where da and dt are the changes of slopes and precisions at fixed cavities.
     """
     terms, covariance, _, _ = primals
     mean, variance, search = fixed_point(*primals)
     sites = sites_of(terms, mean, variance)
-    posterior, transfer = settled(covariance, sites, variance)
+    posterior, transfer = joint_at(covariance, sites, variance)
     joint, ratio = posterior.covariance, 1.0 / posterior.left
     follow, spread, matrix = coupling(sites, posterior, variance)
 
@@ -171,7 +175,7 @@ def _fixed_point_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) 
         return moved, precision, jnp.sum((transfer @ covariance) * transfer, axis=1)
 
     values, tangent = eqx.filter_jvp(changes, (terms, covariance), tangents[:2])
-    # What does not depend on the side that moves has no tangent at all.
+    # An output that does not depend on the perturbed inputs has the tangent None.
     moved, d_precision, widened = (
         jnp.zeros_like(value) if change is None else change for value, change in zip(values, tangent, strict=True)
     )
@@ -187,6 +191,7 @@ def _fixed_point_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) 
 def _log_evidence(
     terms: Tilted, covariance: Float[Array, "n n"], mean: Float[Array, " n"], variance: Float[Array, " n"]
 ) -> Float[Array, ""]:
+    """Log evidence of EP at the given cavities."""
     values, slope, precision = terms(mean, variance)
     _, log_determinant = inverse_and_log_determinant(covariance, precision)
     joined = jnp.sum(values + 0.5 * jnp.log1p(variance * precision))
@@ -197,7 +202,10 @@ def _log_evidence(
 def _log_evidence_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
-    """At the fixed point the evidence is stationary in the cavities: their tangents have no part."""
+    """Derivative of the log evidence.
+
+    It is stationary in the cavities at the fixed point, so their tangents drop out.
+    """
     terms, covariance, mean, variance = primals
     _, slope, precision = terms(mean, variance)
     inverse, _ = inverse_and_log_determinant(covariance, precision)

@@ -1,24 +1,23 @@
-"""Expectation propagation with the leading terms of its own error put back.
+"""Expectation propagation corrected by the leading terms of its error.
 
-EP replaces each answer's tilted distribution by a normal with the same mean and variance. What it misses begins with
-the third cumulants of the tilted distributions, two answers at a time. With a, t, m, v, S and C as in
-`hilbo.inference.ep` and e_i = dt_i/dm (1 + v_i t_i), which is minus the third cumulant over the third power of the
-variance,
+EP replaces each tilted distribution by a normal with the same mean and variance. Its error starts with the third
+cumulants of the tilted distributions, for pairs of observations. With a, t, m, v, S and C as in `hilbo.inference.ep`
+and e_i = dt_i/dm (1 + v_i t_i), which is minus the third cumulant over the third power of the variance,
 
     log Z = EP's + R,      R = 1/12 sum_{i != j} e_i e_j S_ij^3.
 
-Under the true posterior log Z, as a function of the prior mean h at the asked points, has the slope K^-1 (E f - h) and
-the second derivative -C; these say what the mean and the covariance are, without moments of their own:
+Under the true posterior log Z, as a function of the prior mean h at the observed points, has the slope K^-1 (E f - h)
+and the second derivative -C; these give the corrected mean and covariance without further moments:
 
     a becomes a + dR/dh,       C becomes -d2 log Z_EP / dh2 = C - (I - T S) e (I + V)^-1 ... e (I - S T) / 2,
 
-the latter EP's linear response: how its own mean moves with h, cavities and all. Both come from the matrix J of EP's
-Newton steps in one inversion, so that the whole costs little more than two more steps. For Gaussian terms e = 0, and
-nothing changes. Where answers are many and all alike the series converges slowly; `docs/methods/inference.md` has
-the errors.
+the latter EP's linear response: the derivative of its own mean by h, including the cavities. Both come from the matrix
+J of EP's Newton steps in one inversion, so that the correction costs little more than two more steps. For Gaussian
+terms e = 0, and nothing changes. For many identical responses the series converges slowly; `docs/methods/inference.md`
+has the errors.
 
-References: Opper, Paquet & Winther (2013), JMLR 14:2857, equations for R at second order in the third cumulants;
-Opper & Winther (2005), JMLR 6:2177, for linear response.
+References: Opper, Paquet & Winther (2013), JMLR 14:2857, equations for R at second order in the third cumulants; Opper
+& Winther (2005), JMLR 6:2177, for linear response.
 """
 
 import equinox as eqx
@@ -27,7 +26,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hilbo.gaussian import GaussianPosterior
-from hilbo.inference.ep import fixed_point, gaussian, inverse_of, settled
+from hilbo.inference.ep import fixed_point, gaussian, inverse_of, joint_at
 from hilbo.inference.ep_sites import Tilted, coupling, sites_of
 from hilbo.numerics.linalg import cholesky
 
@@ -41,15 +40,15 @@ def ep_corrected(
     start: Float[Array, " n"] | None = None,
     max_steps: int = 200,
 ) -> GaussianPosterior:
-    """[`ep`][hilbo.inference.ep.ep] with its evidence and means corrected to second order, and covariances by linear
-    response.
+    """Expectation propagation with evidence and means corrected to second order, and covariances by linear response.
 
-    Arguments, certificate and derivatives are as there. Not converged, too, where the corrected covariance is none.
+    Arguments, certificate and derivatives as in [`ep`][hilbo.inference.ep.ep]. Also not converged if the corrected
+    covariance is not positive definite.
     """
     mean, variance, search = fixed_point(terms, covariance, start, max_steps)
     uncorrected = gaussian(terms, covariance, mean, variance, search)
     sites = sites_of(terms, mean, variance)
-    posterior, transfer = settled(covariance, sites, variance)
+    posterior, transfer = joint_at(covariance, sites, variance)
     follow, spread, matrix = coupling(sites, posterior, variance)
     response = inverse_of(matrix)
     skew, skew_slopes = _skewness(terms, mean, variance)
@@ -71,7 +70,7 @@ def ep_corrected(
 
 
 class _Cumulants(eqx.Module):
-    """What the correction depends on: e and its slopes (in mean and variance), S, and the slopes of t."""
+    """Inputs of the correction: e and its slopes (in mean and variance), S, and the slopes of t."""
 
     skew: Float[Array, " n"]
     skew_slopes: tuple[Float[Array, " n"], Float[Array, " n"]]
@@ -94,19 +93,19 @@ def _skewness(
     return value, (push(ones, zeros), push(zeros, ones))
 
 
-def _between_answers(covariance: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The covariances of different answers: 0 on the diagonal."""
+def _off_diagonal(covariance: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Covariances between different observations: the diagonal set to 0."""
     return covariance - jnp.diag(jnp.diagonal(covariance))
 
 
 def _correction(cumulants: _Cumulants) -> Float[Array, ""]:
-    """R, what the log evidence lacks."""
-    return cumulants.skew @ (_between_answers(cumulants.covariance) ** 3 @ cumulants.skew) / 12.0
+    """R, the correction of the log evidence."""
+    return cumulants.skew @ (_off_diagonal(cumulants.covariance) ** 3 @ cumulants.skew) / 12.0
 
 
 def _correction_slopes(cumulants: _Cumulants) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """dR/dm and dR/dv, the part that goes through S included: dS = -S dT S."""
-    covariance = _between_answers(cumulants.covariance)
+    """dR/dm and dR/dv, including the part through S: dS = -S dT S."""
+    covariance = _off_diagonal(cumulants.covariance)
     by_skew = covariance**3 @ cumulants.skew / 6.0
     pairs = cumulants.skew[:, None] * covariance**2 * cumulants.skew[None, :]
     by_precision = -0.25 * jnp.sum((cumulants.covariance @ pairs) * cumulants.covariance, axis=1)
@@ -117,7 +116,7 @@ def _correction_slopes(cumulants: _Cumulants) -> tuple[Float[Array, " n"], Float
 def _corrected_factor(
     factor: Float[Array, "n n"], precision: Float[Array, " n"], skew: Float[Array, " n"], widened: Float[Array, "n n"]
 ) -> Float[Array, "n n"]:
-    """V with V'V = the corrected C: a factor of I + A X A' (near I) times EP's own, so that no digit is lost."""
+    """V with V'V = the corrected C: a factor of I + A X A' (near I) times EP's own, to avoid cancellation."""
     informed = precision > 0
     ratio = jnp.where(informed, skew / jnp.where(informed, precision, 1.0), 0.0)
     around = factor * ratio[None, :]

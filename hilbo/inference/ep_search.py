@@ -1,6 +1,6 @@
-"""The search for the fixed point of expectation propagation: damped updates far from it, Newton's steps near it.
+"""Search for the fixed point of expectation propagation: damped updates far from it, Newton's steps near it.
 
-Notation and equations are those of `hilbo.inference.ep`. `find` returns the cavities, undifferentiated.
+Notation and equations are those of `hilbo.inference.ep`. `find` returns the cavities, without derivatives.
 """
 
 from collections.abc import Callable
@@ -31,11 +31,11 @@ __all__ = [
 ]
 
 _QUICK_STEPS = 20
-_BASIN = 3.0  # a mismatch, in posterior sds, below which Newton's step is tried
+_BASIN = 3.0  # mismatch, in posterior sds, below which Newton's step is tried
 
 
 class Cavities(NamedTuple):
-    """Means and variances; a start that is none has a variance that is no positive number."""
+    """Cavity means and variances; variances that are not positive mark the absence of a start."""
 
     mean: Float[Array, " n"]
     variance: Float[Array, " n"]
@@ -47,22 +47,24 @@ class Cavities(NamedTuple):
 
 
 class Found(NamedTuple):
-    """How the search ended; `changed` is what the square root dropped, 0 where none was needed."""
+    """Record of the search; `changed` is the change of K by its square root, 0 where none was needed."""
 
     residual: Float[Array, ""]
-    """Infinite where a hasty search ended by a step that should leave none; then `residual_of` is to measure it."""
+    """Infinite if a `hasty` search ended without measuring it; `residual_of` then computes it."""
     tolerance: Float[Array, ""]
     iterations: Int[Array, ""]
     changed: Float[Array, ""]
 
 
 class _State(eqx.Module):
+    """State of the search."""
+
     mean: Float[Array, " n"]  # of the cavities, as is the variance
     variance: Float[Array, " n"]
     residual: Float[Array, ""]
     tolerance: Float[Array, ""]
     mismatch: Float[Array, ""]  # before a Newton step, infinite before an update
-    ahead: Float[Array, ""]  # what the step should leave of it
+    ahead: Float[Array, ""]  # mismatch predicted after the step
     basin: Float[Array, ""]
     updates: Int[Array, ""]
     steps: Int[Array, ""]
@@ -75,11 +77,12 @@ def find(
     max_steps: int,
     hasty: bool | Bool[Array, ""] = False,
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Found]:
-    """Cavity means and variances, and how they were found. `start`: weights, or cavities, or nothing.
+    """Find the cavity means and variances at the fixed point. `start`: weights, cavities, or None.
 
-    A `hasty` search spares the sweep that would only see that the last step of Newton's was the last.
+    A `hasty` search omits the last evaluation, which would only confirm that Newton's method has converged.
 
-    Under `vmap` one problem after the other on CPUs, each stopping when it is done; elsewhere all at once with a root.
+    Under `vmap` the problems are solved one by one on CPUs, each stopping when it has converged; elsewhere all at once,
+    with a root of K.
     """
     arrays, rest = eqx.partition(terms, eqx.is_array)
 
@@ -95,30 +98,32 @@ def find(
     def quick(arrays, covariance, start, hasty):
         terms = eqx.combine(arrays, rest)
         none = jnp.zeros_like(covariance[0, 0])
-        initial, spent = _initial_without_root(terms, covariance, start)
+        initial, first_steps = _initial_without_root(terms, covariance, start)
         mean, variance, end = _search(terms, covariance, None, initial, min(max_steps, _QUICK_STEPS), none, hasty)
-        fixed_point = mean, variance, end._replace(iterations=end.iterations + spent)
-        met = (end.residual <= end.tolerance) | (hasty & jnp.isinf(end.residual))
+        fixed_point = mean, variance, end._replace(iterations=end.iterations + first_steps)
+        converged = (end.residual <= end.tolerance) | (hasty & jnp.isinf(end.residual))
         _, _, precision = terms(mean, variance)
-        # s = K - KCK errs by eps K, and the cavity's variance by this share:
-        blur = jnp.finfo(none.dtype).eps * jnp.max(jnp.diagonal(covariance) * precision * (1.0 + precision * variance))
+        # s = K - KCK has the error eps K, and the cavity's variance this relative error:
+        relative_error = jnp.finfo(none.dtype).eps * jnp.max(
+            jnp.diagonal(covariance) * precision * (1.0 + precision * variance)
+        )
 
         def restart(root):
             prior = _initial(terms, covariance, root, None)
-            return jax.tree.map(lambda a, b: jnp.where(met, a, b), (mean, variance), prior)
+            return jax.tree.map(lambda a, b: jnp.where(converged, a, b), (mean, variance), prior)
 
         def continued():
             mean, variance, last = with_root(terms, covariance, restart)
-            spent_before = jnp.where(met, fixed_point[2].iterations, 0)
+            spent_before = jnp.where(converged, fixed_point[2].iterations, 0)
             return mean, variance, last._replace(iterations=last.iterations + spent_before)
 
-        return jax.lax.cond(met & (blur <= 0.1 * end.tolerance), lambda: fixed_point, continued)
+        return jax.lax.cond(converged & (relative_error <= 0.1 * end.tolerance), lambda: fixed_point, continued)
 
     return one_at_a_time(quick, safe)(arrays, covariance, start, jnp.asarray(hasty))
 
 
 class _PointTerms(eqx.Module):
-    """The terms at single values, which are cavities of no width: Laplace's terms."""
+    """Terms evaluated at cavities of variance 0, as for Laplace's method."""
 
     terms: Tilted
 
@@ -135,30 +140,33 @@ def _search(
     changed: Float[Array, ""],
     hasty: Bool[Array, ""],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Found]:
-    """From `initial` means and variances to the fixed point; `changed` goes into the record of the search."""
+    """Iterate from the `initial` means and variances to the fixed point; `changed` is passed to the record."""
     largest = jnp.asarray(jnp.inf, covariance.dtype)
     count = jnp.zeros((), jnp.int32)
     basin = jnp.full_like(largest, _BASIN)
     mean, variance = initial
     first = _State(mean, variance, largest, jnp.zeros_like(largest), largest, largest, basin, count, count)
 
-    def unmeasured(search):
+    def skips_check(search):
         return hasty & (search.ahead <= 0.1 * search.tolerance)
 
     def unfinished(search):
         # One step at least: Laplace's mode may be the fixed point, but only to the digits of its own variances.
         done = (search.residual <= search.tolerance) & ((search.steps > 1) | (search.residual == 0.0))
-        return (search.steps < max_steps) & ~done & ~unmeasured(search) & ~jnp.isnan(search.mismatch)
+        return (search.steps < max_steps) & ~done & ~skips_check(search) & ~jnp.isnan(search.mismatch)
 
     end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), first)
-    residual = jnp.where(unmeasured(end) & (end.residual > end.tolerance), jnp.inf, end.residual)
+    residual = jnp.where(skips_check(end) & (end.residual > end.tolerance), jnp.inf, end.residual)
     return end.mean, end.variance, Found(residual, end.tolerance, end.steps, changed)
 
 
 def _initial_without_root(
     terms: Tilted, covariance: Float[Array, "n n"], start: Float[Array, " n"] | Cavities | None
 ) -> tuple[tuple[Float[Array, " n"], Float[Array, " n"]], Int[Array, ""]]:
-    """Where the search without a root begins, at Laplace's mode if nothing is known, and the steps that took."""
+    """Initial cavities for the search without a root, at Laplace's mode without a start.
+
+    And the number of steps taken.
+    """
 
     def from_mode():
         mode = plain_mode(_PointTerms(terms), covariance, jnp.zeros_like(covariance[0]), _QUICK_STEPS)
@@ -179,7 +187,7 @@ def _initial(
     root: Float[Array, "n n"] | None,
     start: Float[Array, " n"] | Cavities | None,
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """The prior's cavities; or those around the mean K start, with the sites' precisions at that mean."""
+    """Initial cavities: the prior's; or those around the mean K start, with the sites' precisions at that mean."""
     prior = jnp.diagonal(covariance)
     if start is None:
         return jnp.zeros_like(prior), prior
@@ -196,7 +204,7 @@ def _initial(
 def _advance(
     terms: Tilted, covariance: Float[Array, "n n"], root: Float[Array, "n n"] | None, search: _State
 ) -> _State:
-    """Evaluate the mismatch of the cavities and move them, by Newton's step or a damped update."""
+    """One step of the search: evaluate the mismatch of the cavities, then take a Newton step or a damped update."""
     m, v = search.mean, search.variance
     sites = sites_of(terms, m, v)
     posterior = joint_of(covariance, root, sites.precision)
@@ -232,7 +240,7 @@ def _advance(
 
 
 class _Means(NamedTuple):
-    """Means of the tilted distributions, a + t of these, and the means that the joint posterior has instead."""
+    """Tilted means, their natural parameters a + t·mean, and the means of the joint posterior."""
 
     tilted: Float[Array, " n"]
     natural: Float[Array, " n"]
@@ -247,21 +255,21 @@ def _mismatch(
     posterior: Joint,
     means: _Means,
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Residual and tolerance of the worse of mean and variance, and the mismatch in posterior sds that steers."""
+    """Residual and tolerance of the worse of mean and variance; mismatch (posterior sds) that controls the search."""
     tilted, natural, matched = means
     epsilon = jnp.finfo(tilted.dtype).eps
-    apart = jnp.where(sites.precision > 0, jnp.abs(matched - tilted), 0.0)
+    mean_gap = jnp.where(sites.precision > 0, jnp.abs(matched - tilted), 0.0)
     ratio = posterior.variance / (posterior.left * search.variance)
-    stretched = jnp.where(sites.precision > 0, jnp.abs(jnp.log(ratio)), 0.0)
+    log_ratio = jnp.where(sites.precision > 0, jnp.abs(jnp.log(ratio)), 0.0)
     prior = jnp.diagonal(covariance)
-    residuals = jnp.stack([jnp.max(apart / jnp.sqrt(prior)), jnp.max(stretched)])
+    residuals = jnp.stack([jnp.max(mean_gap / jnp.sqrt(prior)), jnp.max(log_ratio)])
     tolerances = jnp.full((2,), epsilon ** (2 / 3), tilted.dtype)
-    if root is not None:  # the last resort ends at its rounding
+    if root is not None:  # the final fallback stops at its rounding error
         summed = jnp.abs(root).T @ (jnp.abs(natural) + sites.precision * jnp.abs(matched))
         rounding = jnp.stack([jnp.linalg.norm(summed), jnp.max(1.0 + sites.precision * search.variance)])
         tolerances = jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
     worse = jnp.argmax(residuals / tolerances)
-    mismatch = jnp.maximum(jnp.max(apart / jnp.sqrt(posterior.variance)), residuals[1])
+    mismatch = jnp.maximum(jnp.max(mean_gap / jnp.sqrt(posterior.variance)), residuals[1])
     return residuals[worse], tolerances[worse], mismatch
 
 
@@ -272,30 +280,31 @@ def residual_of(
     precision: Float[Array, " n"],
     posterior: tuple[Float[Array, " n"], Callable[[Float[Array, " n"]], Float[Array, " n"]]],
 ) -> Float[Array, ""]:
-    """What the search would see at these cavities; `posterior`: its variances, and what multiplies by C.
+    """Residual of these cavities, as the search would compute it.
 
-    With P = I - K C the means differ by P (K a - m - v a), and the cavities' variances should be s / (1 - t s).
+    `posterior`: its variances, and a function that multiplies by C. With P = I - K C the means differ by P (K a - m - v
+    a), and the cavities' variances should be s / (1 - t s).
     """
-    variance, explain = posterior
+    variance, multiply_by_C = posterior
     tilted = cavities.mean + cavities.variance * weights
     gap = covariance @ weights - tilted
-    apart = jnp.abs(gap - covariance @ explain(gap)) / jnp.sqrt(jnp.diagonal(covariance))
-    stretched = jnp.abs(jnp.log(variance / ((1.0 - precision * variance) * cavities.variance)))
-    return jnp.max(jnp.where(precision > 0, jnp.maximum(apart, stretched), 0.0))
+    mean_gap = jnp.abs(gap - covariance @ multiply_by_C(gap)) / jnp.sqrt(jnp.diagonal(covariance))
+    log_ratio = jnp.abs(jnp.log(variance / ((1.0 - precision * variance) * cavities.variance)))
+    return jnp.max(jnp.where(precision > 0, jnp.maximum(mean_gap, log_ratio), 0.0))
 
 
 def _newton_step(
     sites: Sites,
     posterior: Joint,
     variance: Float[Array, " n"],
-    apart: Float[Array, " n"],
-    wider: Float[Array, " n"],
+    mean_gap: Float[Array, " n"],
+    variance_gap: Float[Array, " n"],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Changes of m and v that close the gaps `apart` of the means and `wider` of the cavity variances, to first order.
+    """Newton step (dm, dv) that closes the gaps of means and cavity variances to first order.
 
-    dm = W dv + (1 + v t) apart,      J dv = wider - Q (dt/dm (1 + v t) apart).
+    dm = W dv + (1 + v t) mean_gap,      J dv = variance_gap - Q (dt/dm (1 + v t) mean_gap).
     """
     follow, spread, matrix = coupling(sites, posterior, variance)
-    free = (1.0 + variance * sites.precision) * apart
-    dv = solve(matrix, wider - spread @ (sites.precision_m * free))
+    free = (1.0 + variance * sites.precision) * mean_gap
+    dv = solve(matrix, variance_gap - spread @ (sites.precision_m * free))
     return free + follow @ dv, dv

@@ -1,4 +1,4 @@
-"""The sites of expectation propagation, the Gaussian posterior that they make, and how cavities move together.
+"""Sites of expectation propagation, their Gaussian posterior, and the coupling of the cavities in Newton's method.
 
 Notation and equations are those of `hilbo.inference.ep`.
 """
@@ -22,7 +22,7 @@ Tilted = Callable[
 
 
 class Sites(eqx.Module):
-    """Slopes and precisions of the sites, and how they change with the cavities (elementwise)."""
+    """Slopes and precisions of the sites, and their derivatives by the cavity means and variances (elementwise)."""
 
     slope: Float[Array, " n"]
     precision: Float[Array, " n"]
@@ -32,24 +32,24 @@ class Sites(eqx.Module):
 
 
 def sites_of(terms: Tilted, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> Sites:
-    """The sites that belong to these cavities, by differentiating the terms once in each direction."""
+    """Sites for the given cavities, from one linearisation of the terms."""
     (_, slope, precision), push = jax.linearize(terms, mean, variance)
-    ones, zeros = jnp.ones_like(mean), jnp.zeros_like(mean)  # the terms are independent: one tangent serves them all
+    ones, zeros = jnp.ones_like(mean), jnp.zeros_like(mean)  # the terms are independent, so one tangent suffices
     _, _, precision_m = push(ones, zeros)
     _, slope_v, precision_v = push(zeros, ones)
     return Sites(slope, precision, slope_v, precision_m, precision_v)
 
 
 class Joint(eqx.Module):
-    """The Gaussian posterior of all latent values, prior and sites together."""
+    """Gaussian posterior of all latent values, from prior and sites."""
 
     covariance: Float[Array, "n n"]  # S = (K^-1 + T)^-1
     variance: Float[Array, " n"]
-    left: Float[Array, " n"]  # 1 - t s: the share of the variance that is left when the site joins its cavity
+    left: Float[Array, " n"]  # 1 - t s: posterior variance / cavity variance
 
 
 def joint_of(covariance: Float[Array, "n n"], root: Float[Array, "n n"] | None, precision: Float[Array, " n"]) -> Joint:
-    """S = G'G with L G = R', LL' = I + R'TR: a sum of squares, no inverse of K or T; without R, S = K - K C K."""
+    """Joint posterior S = G'G with L G = R', LL' = I + R'TR; without the root R, S = K - K C K."""
     if root is None:
         scale, _, lower = factorise(covariance, precision)
         through = solve_lower(lower, scale[:, None] * covariance)
@@ -65,14 +65,17 @@ def joint_of(covariance: Float[Array, "n n"], root: Float[Array, "n n"] | None, 
 def coupling(
     sites: Sites, posterior: Joint, variance: Float[Array, " n"]
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"], Float[Array, "n n"]]:
-    """W: how the means follow the cavity variances; Q: how these follow the precisions; J = I + Q (dt/dv + dt/dm W).
+    """Matrices W, Q and J of Newton's step.
 
-    The means' equation has the inverse diag(1 + v t) (I - S T); dv_i = -(s_i / left_i s_i)^2 sum_{j != i} S_ij^2 dt_j.
+    W: derivative of the means by the cavity variances; Q: of these by the precisions; J = I + Q (dt/dv + dt/dm W). The
+    means' equation has the inverse diag(1 + v t) (I - S T); dv_i = -(s_i / left_i s_i)^2 sum_{j != i} S_ij^2 dt_j.
     """
     eye = jnp.eye(variance.shape[0], dtype=variance.dtype)
-    moved = posterior.covariance * sites.slope_v[None, :]
-    held = (eye - posterior.covariance * sites.precision[None, :]) * (variance * sites.slope_v + sites.slope)[None, :]
-    follow = (1.0 + variance * sites.precision)[:, None] * (moved - held)
+    from_slopes = posterior.covariance * sites.slope_v[None, :]
+    from_transfer = (eye - posterior.covariance * sites.precision[None, :]) * (variance * sites.slope_v + sites.slope)[
+        None, :
+    ]
+    follow = (1.0 + variance * sites.precision)[:, None] * (from_slopes - from_transfer)
     spread = posterior.covariance**2 * (1.0 - eye) / (posterior.left**2)[:, None]
     matrix = eye + spread * sites.precision_v[None, :] + spread @ (sites.precision_m[:, None] * follow)
     return follow, spread, matrix
@@ -80,5 +83,5 @@ def coupling(
 
 @one_at_a_time
 def solve(matrix: Float[Array, "n n"], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """X with `matrix` X = `right`, by elimination."""
+    """Solve `matrix` X = `right` by elimination."""
     return jnp.linalg.solve(matrix, right)

@@ -1,23 +1,23 @@
-"""The exact ordinal posterior, by sampling with a stated standard error: the yardstick for the approximations.
+"""Exact ordinal posterior by sampling, with standard errors: the reference for the approximations.
 
-With z = f + noise * e an ordinal answer is the event that z_i lies between two thresholds. All answers together are a
-box of z ~ N(0, S), S = K + noise^2 I = L L', and f given z is Gaussian, so that with x = L^-1 z
+With z = f + noise * e an ordinal response is the event that z_i lies between two thresholds. All responses together are
+a box of z ~ N(0, S), S = K + noise^2 I = L L', and f given z is Gaussian, so that with x = L^-1 z
 
-    p(answers) = P(box),   E f* = k*' L^-T E[x],   Var f* = k** - |L^-1 k*|^2 + k*' L^-T Cov[x] L^-1 k*,
+    p(responses) = P(box),   E f* = k*' L^-T E[x],   Var f* = k** - |L^-1 k*|^2 + k*' L^-T Cov[x] L^-1 k*,
 
 expectations over the box. They are sampled by minimax exponential tilting: coordinate after coordinate, x_i is drawn
-from N(mu_i, 1) confined to what its interval leaves, with the weight exp(psi(x, mu)),
+from N(mu_i, 1) truncated to the interval given the earlier coordinates, with the weight exp(psi(x, mu)),
 
     psi(x, mu) = sum_i [mu_i^2 / 2 - mu_i x_i + log P(N(mu_i, 1) in interval_i(x_1 .. x_{i-1}))],
 
 concave in x and convex in mu. At its saddle point the weights vary little even for improbable boxes, and none exceeds
-`exp(psi*)`, so that taking x with probability `exp(psi - psi*)` gives independent exact draws. The variables are
-ordered by how improbable their intervals are, and the uniform numbers are scrambled Sobol points: independent scrambles
+`exp(psi*)`, so that accepting x with probability `exp(psi - psi*)` gives independent exact draws. The variables are
+ordered by the probability of their intervals, and the uniform numbers are scrambled Sobol points: independent scrambles
 are the replicates from which the standard errors come.
 
-Good to about 100 answers. Any tilting gives a right answer with an honest error; a poor one a large error.
-References: Botev (2017), JRSS B 79:125; Genz (1992), J. Comput. Graph. Stat. 1:141; Gibson, Glasbey & Elston (1994)
-for the order of the variables.
+Suitable for up to about 100 responses. Any tilting gives an unbiased result with a valid standard error; a poor one
+gives a large error. References: Botev (2017), JRSS B 79:125; Genz (1992), J. Comput. Graph. Stat. 1:141; Gibson,
+Glasbey & Elston (1994) for the order of the variables.
 """
 
 from collections.abc import Callable
@@ -39,41 +39,41 @@ _REPLICATES = 32
 
 
 class SamplingCertificate(eqx.Module):
-    """What a sampled answer can say of its own accuracy."""
+    """Accuracy of a sampled posterior."""
 
     residual: Float[Array, ""]
     """The larger of the two standard errors below; infinite where the variance of f given z is below rounding."""
     tolerance: Float[Array, ""]
-    """What is still called exact: 0.02."""
+    """Largest accepted residual: 0.02."""
     log_evidence_error: Float[Array, ""]
     """Standard error of the log evidence, and a bound on its rounding: eps |log evidence| max S / min of L's diagonal
-    squared, which counts where answers contradict each other under a prior that is very much wider than the noise."""
+    squared, which matters for contradictory responses under a prior that is much wider than the noise."""
     mean_error: Float[Array, ""]
-    """Largest standard error of a latent mean at an asked point, in prior standard deviations."""
+    """Largest standard error of a latent mean at an observed point, in prior standard deviations."""
     effective_samples: Float[Array, ""]
     """Squared sum of the weights over their sum of squares."""
     iterations: Int[Array, ""]
     """Newton steps to the tilting, rejected ones included."""
     jitter: Float[Array, ""]
-    """Largest amount, of 1, by which a sampled variance exceeded the prior's; the excess is dropped."""
+    """Largest relative amount by which a sampled variance exceeded the prior's; the excess is dropped."""
     converged: Bool[Array, ""]
     """residual <= tolerance."""
 
 
 class ExactPosterior(eqx.Module):
-    """Moments of p(f | answers) in the form of the other posteriors, and the samples behind them."""
+    """Moments of p(f | responses) in the form of the other posteriors, and the samples behind them."""
 
     mode: Float[Array, " n"]
-    """Posterior mean of the latent values at the asked points."""
+    """Posterior mean of the latent values at the observed points."""
     weights: Float[Array, " n"]
     factor: Float[Array, "n n"]
     inverse: Float[Array, "n n"]
     log_evidence: Float[Array, ""]
     certificate: SamplingCertificate
     samples: Float[Array, "n R B"]
-    """x of every replicate, 0 where there is no answer."""
+    """x of every replicate, 0 in rows without a response."""
     shares: Float[Array, "R B"]
-    """The weight of each sample over all weights; they sum to 1."""
+    """Normalised weight of each sample; they sum to 1."""
     box: Box
     tilt: Tilt
 
@@ -97,7 +97,7 @@ class ExactPosterior(eqx.Module):
     def moment_errors(self, cross: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Standard errors of the posterior means and variances at m points.
 
-        `cross` (n, m): covariances of the asked and the new points -> (m,), (m,).
+        `cross` (n, m): covariances of the observed and the new points -> (m,), (m,).
         """
 
         def one(along):
@@ -132,16 +132,16 @@ def exact(
     answered: Bool[Array, " n"],
     samples: int = 512 * _REPLICATES,
 ) -> ExactPosterior:
-    """The posterior of f ~ N(0, K) given that f + noise * e lies between `lower` and `upper` where `answered`.
+    """Sample the posterior of f ~ N(0, K) given that f + noise * e lies between `lower` and `upper` where `answered`.
 
     **Arguments:**
 
-    - `key`: another key gives other samples, that is another error of the stated size.
-    - `covariance`: K, (n, n), of whatever rank; the noise makes the rest of the matrix definite.
+    - `key`: another key gives other samples, hence another error of the stated size.
+    - `covariance`: K, (n, n), of any rank.
     - `lower`, `upper`: edges (n,), infinite at the ends.
-    - `samples`: in all, a power of 2 times 32. The error falls a little less than in proportion to their number.
+    - `samples`: total number, a power of 2 times 32. The error falls slightly less than in proportion to it.
 
-    **Returns:** an [`ExactPosterior`][]. It has no derivatives: asked for one, `exact` raises `InputError`.
+    **Returns:** an [`ExactPosterior`][]. It has no derivatives: differentiating it raises `InputError`.
     """
     box = ordered_box(covariance, lower, upper, noise, answered)
     tilt = tilting(box)
@@ -159,7 +159,7 @@ def exact(
     wide = (jnp.max(jnp.diagonal(covariance)) + noise**2) * jnp.max(jnp.sum(box.half**2, axis=1))
     rounding = jnp.finfo(x.dtype).eps * wide * jnp.abs(log_evidence)
     certificate = _certificate(covariance, box, tilt, x, shares, excess, rounding)
-    certificate = _unless_resolved(certificate, covariance, box.half, answered)
+    certificate = _checked_resolution(certificate, covariance, box.half, answered)
     return ExactPosterior(
         covariance @ weights, weights, factor, factor.T @ factor, log_evidence, certificate, x, shares, box, tilt
     )  # fmt: skip
@@ -167,14 +167,17 @@ def exact(
 
 @exact.def_jvp
 def _exact_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> NoReturn:
+    """Refuse differentiation: raise `InputError`."""
     raise InputError('inference "exact" is sampled and has no derivatives; use "ep" where they are needed.')
 
 
 def _narrowed(
     x: Float[Array, "n R B"], shares: Float[Array, "R B"], mean: Float[Array, " n"], answered: Bool[Array, " n"]
 ) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
-    """A root of I - Cov[x], and the largest eigenvalue of Cov[x] - I: the box is convex, so that all beyond 0 is
-    sampling error."""
+    """Root of I - Cov[x], and the largest eigenvalue of Cov[x] - I, clipped at 0.
+
+    The box is convex, so that any positive part is sampling error.
+    """
     centred = x - mean[:, None, None]
     lessened = jnp.diag(answered.astype(x.dtype)) - jnp.tensordot(centred * shares[None], centred, [(1, 2), (1, 2)])
     eigenvalues, vectors = eigh(lessened)
@@ -191,7 +194,7 @@ def _certificate(
     excess: Float[Array, ""],
     rounding: Float[Array, ""],
 ) -> SamplingCertificate:
-    """`excess`: by how much a sampled variance exceeded 1; `rounding`: of the log evidence."""
+    """Certificate of the samples; `excess`: excess of a sampled variance over 1; `rounding` of the log evidence."""
     total = jnp.sum(shares, axis=1)
     log_error = jnp.hypot(jnp.std(total, ddof=1) / jnp.mean(total) / total.shape[0] ** 0.5, rounding)
     latent = jnp.moveaxis(x, 0, -1) @ (box.half @ covariance)
@@ -210,13 +213,13 @@ def _certificate(
     )
 
 
-def _unless_resolved(
+def _checked_resolution(
     certificate: SamplingCertificate,
     covariance: Float[Array, "n n"],
     half: Float[Array, "n n"],
     answered: Bool[Array, " n"],
 ) -> SamplingCertificate:
-    """Not converged where the rounding of an asked point's variance given z hides that variance, near noise^2."""
+    """Certificate set to not converged if rounding hides the variance of an observed value given z (about noise^2)."""
     prior = jnp.diagonal(covariance)
     variance = prior - jnp.sum((half @ covariance) ** 2, axis=0)
     resolution = jnp.finfo(prior.dtype).eps * prior.shape[0] ** 0.5 * jnp.max(prior)

@@ -1,7 +1,7 @@
-"""A box under a Gaussian, coordinate after coordinate: order of the variables, minimax tilting, proposals, draws.
+"""Sampling of a Gaussian confined to a box: order of the variables, minimax tilting, proposals and accepted draws.
 
 z ~ N(0, S), S = L L', is confined to a box; x = L^-1 z. With the rows of L divided by its diagonal, the interval of
-variable i in units of that diagonal is (lower_i, upper_i) less what the earlier variables contribute, (below x)_i.
+variable i in units of that diagonal is (lower_i, upper_i) minus the contribution (below x)_i of the earlier variables.
 Equations and references: `hilbo.inference.exact`.
 """
 
@@ -20,33 +20,33 @@ __all__ = ["Box", "Tilt", "accepted", "ordered_box", "propose", "tilting"]
 
 
 class Box(eqx.Module):
-    """The box in x, variables ordered: edges and Lower are in units of L's diagonal, Lower without its ones."""
+    """Box in x with ordered variables; edges and `below` (L without its diagonal) are in units of L's diagonal."""
 
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
     below: Float[Array, "n n"]
     half: Float[Array, "n n"]
-    """L^-1, its columns in the caller's order, its rows 0 where there is no answer."""
+    """L^-1, its columns in the caller's order, its rows 0 for rows without a response."""
     answered: Bool[Array, " n"]
 
 
 class Tilt(eqx.Module):
-    """The saddle point of psi: the means that make the weights of samples vary least."""
+    """Saddle point of psi: the tilting that minimises the variation of the weights."""
 
     mu: Float[Array, " n"]
     highest: Float[Array, ""]
-    """psi*, which psi(x, mu) never exceeds."""
+    """psi*, upper bound of psi(x, mu)."""
     gradient: Float[Array, ""]
     iterations: Int[Array, ""]
 
 
 class _Ordering(NamedTuple):
-    """The first variables placed: columns of the root of S, expected values, and which variables they are."""
+    """State of the ordering: columns of the root of S, expected values, order, and flags of the ordered variables."""
 
     columns: Float[Array, "n n"]
     values: Float[Array, " n"]
     order: Int[Array, " n"]
-    placed: Bool[Array, " n"]
+    is_ordered: Bool[Array, " n"]
 
 
 def ordered_box(
@@ -56,23 +56,26 @@ def ordered_box(
     noise: Float[Array, ""],
     answered: Bool[Array, " n"],
 ) -> Box:
-    """Interval after interval the least probable one, given the expected values of those before it."""
+    """Box with its variables in greedy order: next the least probable interval given the expected earlier values."""
     n = covariance.shape[0]
     both = answered[:, None] & answered[None, :]
     matrix = jnp.where(both, covariance, 0.0) + jnp.diag(jnp.where(answered, noise**2, 1.0))
     lower, upper = jnp.where(answered, lower, -jnp.inf), jnp.where(answered, upper, jnp.inf)
 
     def next_variable(k, state: _Ordering) -> _Ordering:
-        columns, values, order, placed = state
+        columns, values, order, is_ordered = state
         spread = jnp.sqrt(jnp.diagonal(matrix) - jnp.sum(columns**2, axis=1))
         shift = columns @ values
         edges = (lower - shift) / spread, (upper - shift) / spread
         log_mass, mean, _ = _intervals(jnp.zeros_like(shift), *edges, answered)
-        row = jnp.argmin(jnp.where(placed, 2.0, jnp.where(answered, log_mass, 1.0))).astype(order.dtype)
+        row = jnp.argmin(jnp.where(is_ordered, 2.0, jnp.where(answered, log_mass, 1.0))).astype(order.dtype)
         column = (matrix[:, row] - columns @ columns[row]) / spread[row]
-        column = jnp.where(placed, 0.0, column).at[row].set(spread[row])
+        column = jnp.where(is_ordered, 0.0, column).at[row].set(spread[row])
         return _Ordering(
-            columns.at[:, k].set(column), values.at[k].set(mean[row]), order.at[k].set(row), placed.at[row].set(True)
+            columns.at[:, k].set(column),
+            values.at[k].set(mean[row]),
+            order.at[k].set(row),
+            is_ordered.at[row].set(True),
         )
 
     state = _Ordering(jnp.zeros_like(matrix), jnp.zeros_like(lower), jnp.zeros(n, jnp.int32), jnp.zeros(n, bool))
@@ -89,7 +92,7 @@ def ordered_box(
 def _intervals(
     mean: Float[Array, "*n"], lower: Float[Array, "*n"], upper: Float[Array, "*n"], answered: Bool[Array, "*n"]
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """`confined_normal` of every variable; where there is no answer there is no interval, and all is 0."""
+    """`confined_normal` of every variable; all 0 for rows without a response."""
     lower = jnp.where(answered, lower, 0.0)
     log_mass, shift, curvature = jnp.vectorize(confined_normal, signature="(),(),()->(),(),()")(
         mean, lower, jnp.where(answered, upper, jnp.inf)
@@ -98,7 +101,7 @@ def _intervals(
 
 
 class _Saddle(eqx.Module):
-    """A point of the search for the saddle, and Newton's step from it."""
+    """Iterate of the search for the saddle point, with Newton's step from it."""
 
     x: Float[Array, " n"]
     mu: Float[Array, " n"]
@@ -112,10 +115,10 @@ class _Saddle(eqx.Module):
 
 
 def tilting(box: Box, max_steps: int = 100) -> Tilt:
-    """The saddle point of psi by Newton's method.
+    """Find the saddle point of psi by Newton's method.
 
-    A step is shortened until the simplified step that would follow, by the same matrix, is the shorter one: a test that
-    does not depend on the units of x and mu, which conflicting repeats stretch by sd / noise (Deuflhard 2011, 3.3).
+    A step is shortened until the simplified step that would follow, by the same matrix, is shorter: a test that is
+    invariant to the units of x and mu, which conflicting repeats stretch by sd / noise (Deuflhard 2011, 3.3).
     """
     n = box.lower.shape[0]
     initial = _saddle(box, _expected(box), jnp.zeros_like(box.lower))
@@ -137,7 +140,7 @@ def tilting(box: Box, max_steps: int = 100) -> Tilt:
 
 
 def _expected(box: Box) -> Float[Array, " n"]:
-    """x, each at its expected value given those before it, without tilting: inside the box, and psi flat in mu."""
+    """Initial x without tilting: each coordinate at its expected value given the earlier ones, inside the box."""
 
     def one(x, k):
         shift = box.below[k] @ x
@@ -148,7 +151,7 @@ def _expected(box: Box) -> Float[Array, " n"]:
 
 
 def _saddle(box: Box, x: Float[Array, " n"], mu: Float[Array, " n"]) -> _Saddle:
-    """psi, its gradient, in x and in mu, and Newton's step at a point."""
+    """psi, its gradient in x and in mu, and Newton's step, at a point."""
     shift = box.below @ x + mu
     log_mass, mean, curvature = _intervals(shift, box.lower, box.upper, box.answered)
     a, b = box.below.T @ mean - mu, mu - x + mean
@@ -164,6 +167,7 @@ def _saddle(box: Box, x: Float[Array, " n"], mu: Float[Array, " n"]) -> _Saddle:
 
 @one_at_a_time
 def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solve a linear system by elimination."""
     return jnp.linalg.solve(matrix, right)
 
 
@@ -173,7 +177,10 @@ def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Arra
 def propose(
     box: Box, mu: Float[Array, " n"], uniform: Float[Array, "n N"]
 ) -> tuple[Float[Array, "n N"], Float[Array, " N"]]:
-    """x (n, N) from the tilted sequence of confined normals, and psi (N,), from uniform numbers (n, N)."""
+    """Draw x (n, N) from the tilted sequence of truncated normals; also return psi (N,).
+
+    `uniform`: uniform numbers (n, N).
+    """
     n, count = uniform.shape
 
     def one(state, k):
@@ -190,11 +197,11 @@ def propose(
 def _confined(
     uniform: Float[Array, " N"], lower: Float[Array, " N"], upper: Float[Array, " N"]
 ) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
-    """Quantile of a standard normal confined to (lower, upper), and log of the mass of that interval.
+    """Quantile of a standard normal truncated to (lower, upper), and log of the probability of that interval.
 
-    Reflected so that lower + upper >= 0. With Q the upper tail and R = Q(high) / Q(low), the quantile t has
-    Q(t) = Q(low) (1 - u (1 - R)): by the inverse normal distribution near the centre, by Newton's method in log Q
-    (three steps from a Rayleigh quantile) beyond 3.
+    Reflected so that lower + upper >= 0. With Q the upper tail and R = Q(high) / Q(low), the quantile t has Q(t) =
+    Q(low) (1 - u (1 - R)): by the inverse normal distribution near the centre, by Newton's method in log Q (three steps
+    from a Rayleigh quantile) beyond 3.
     """
     mirrored = lower + upper < 0
     low, high = jnp.where(mirrored, -upper, lower), jnp.where(mirrored, -lower, upper)
@@ -222,7 +229,7 @@ def _confined(
 
 
 class _Draws(NamedTuple):
-    """Accepted draws, the first `filled` rows; the others are NaN."""
+    """State of the rejection sampling: accepted draws in the first `filled` rows, the others NaN."""
 
     key: PRNGKeyArray
     kept: Float[Array, "count n"]
@@ -231,7 +238,10 @@ class _Draws(NamedTuple):
 
 
 def accepted(key: PRNGKeyArray, box: Box, tilt: Tilt, count: int) -> Float[Array, "count n"]:
-    """`count` independent draws of x (count, n); proposals are taken with probability exp(psi - psi*)."""
+    """Draw `count` independent x (count, n) by rejection sampling with acceptance probability exp(psi - psi*).
+
+    NaN if the tilting has not converged, and for rows not filled after 1000 rounds.
+    """
     n, batch = box.lower.shape[0], 2 * count
     tilted = tilt.gradient <= 1e-3
 
