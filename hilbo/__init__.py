@@ -1,6 +1,6 @@
-"""hilbo: human-in-the-loop Bayesian optimisation from ordinal answers.
+"""hilbo: human-in-the-loop Bayesian optimisation from ordinal responses.
 
-Everything loads on first use, so that `import hilbo` costs nothing and the parts that need no JAX stay without it.
+Submodules are imported on first use, so that `import hilbo` is fast and parts that need no JAX do not import it.
 """
 
 from typing import TYPE_CHECKING
@@ -89,7 +89,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors; a test compar
 
 def __getattr__(name: str):
     if name == "__version__":
-        from importlib.metadata import version  # slow to import, and rarely asked for
+        from importlib.metadata import version  # slow to import, and rarely needed
 
         return version("hilbo")
     return _names(name)

@@ -1,11 +1,11 @@
-"""Trial selection: scores of candidate renderings from the posterior, and their maximum over a search space.
+"""Acquisition functions for trial selection: scores of candidate stimuli, and their maximisation over a search space.
 
-A score takes the posterior mean and variance of f at one point. The next rendering maximises it over a candidate set
-and is then polished by Newton's method in the optimiser's coordinates, in which the feasible set is a cube.
+A score takes the posterior mean and variance of f at one point. The next stimulus maximises it over a candidate set and
+is then refined by Newton's method in the optimiser's coordinates, in which the feasible set is a cube.
 
     UCB (paper, section IV-3):   mu + weight * sigma
     log expected improvement:    log( sigma * h((mu - best) / sigma) ),  h(z) = phi(z) + z Phi(z)
-    top category:                log P(highest answer) = log Phi((mu - t) / sqrt(noise^2 + sigma^2))
+    top category:                log P(highest response) = log Phi((mu - t) / sqrt(noise^2 + sigma^2))
     Thompson:                    the maximum of one draw of f over the candidates
 
 Log expected improvement after Ament et al. (2023), arXiv:2310.20708: without the logarithm it is 0, and flat, wherever
@@ -32,7 +32,7 @@ def __dir__() -> list[str]:
 
 
 Score = Callable[[Float[Array, ""], Float[Array, ""]], Float[Array, ""]]
-"""Posterior mean and variance at a point -> how much we want to ask there."""
+"""Posterior mean and variance at a point -> score of testing that point."""
 
 
 class UCB(eqx.Module):
@@ -44,14 +44,17 @@ class UCB(eqx.Module):
         return mean + self.weight.astype(mean.dtype) * jnp.sqrt(variance)
 
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
-        """With all of the prior's variance left; `weight` is not negative."""
+        """Upper bound of the score given the posterior mean, with at most the `prior` variance.
+
+        `weight` is not negative.
+        """
         return self(mean, prior)
 
 
 class LogEI(eqx.Module):
-    """Logarithm of the expected improvement over `best`, usually the largest posterior mean among the asked points.
+    """Logarithm of the expected improvement over `best`, usually the largest posterior mean among the tested points.
 
-    Where the variance is 0 the improvement is certain: log(mean - best), and -inf where there is none.
+    Where the variance is 0 the improvement is certain: log(mean - best), and -inf if it is not positive.
     """
 
     best: Float[Array, ""] = eqx.field(converter=jnp.asarray)
@@ -63,12 +66,12 @@ class LogEI(eqx.Module):
         return jnp.where(certain, sure, jnp.log(sd) + _log_improvement(gain / sd))
 
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
-        """With all of the prior's variance left: more spread means more improvement."""
+        """Upper bound of the score given the posterior mean, reached with all of the `prior` variance left."""
         return self(mean, prior)
 
 
 class TopCategory(eqx.Module):
-    """Log probability of the highest category: `threshold` is its lower edge, `noise` the answers' noise."""
+    """Log probability of the highest category: `threshold` is its lower edge, `noise` the sd of the response noise."""
 
     threshold: Float[Array, ""] = eqx.field(converter=jnp.asarray)
     noise: Float[Array, ""] = eqx.field(converter=jnp.asarray)
@@ -78,12 +81,15 @@ class TopCategory(eqx.Module):
         return jax.scipy.special.log_ndtr((mean - self.threshold.astype(mean.dtype)) / spread)
 
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
-        """Certain where the mean is above the threshold, as uncertain as the prior below it."""
+        """Upper bound of the score given the posterior mean.
+
+        Reached with variance 0 where the mean is above the threshold, and with the `prior` variance below it.
+        """
         return self(mean, jnp.where(mean > self.threshold.astype(mean.dtype), 0.0, prior))
 
 
 def _log_improvement(z: Float[Array, "*m"]) -> Float[Array, "*m"]:
-    """log(phi(z) + z Phi(z)). For z < 0 it is phi(z) (1 - |z| Q/phi) = phi(z) * excess / hazard: no cancellation."""
+    """log(phi(z) + z Phi(z)), for z < 0 as phi(z) (1 - |z| Q/phi) = phi(z) * excess / hazard to avoid cancellation."""
     below = jnp.where(z < 0, -z, 0.0)
     excess = excess_hazard(below)
     left = -0.5 * below**2 - HALF_LOG_2PI + jnp.log(excess) - jnp.log(below + excess)
@@ -104,16 +110,16 @@ def maximise(
     steps: int = 50,
     **search: Any,
 ) -> Choice:
-    """The best of the candidates and of `starts` polished ones.
+    """Maximise a score over candidates, and refine the `starts` best ones by Newton's method.
 
     **Arguments:**
 
-    - `values`: scores (m,) of the `candidates` (m, d), feasible points of the unit cube. They only rank the
-      candidates, so single precision will do: the best ones are scored again.
+    - `values`: scores (m,) of the `candidates` (m, d), feasible points of the unit cube. They only rank the candidates,
+      so single precision is sufficient: the best ones are scored again.
     - `score`: the same score for one point, differentiable.
-    - `allowed`: which points may be chosen at all, e.g. none too near to earlier ones.
-    - `starts`, `steps`: how many candidates, at least 0.1 apart, are polished, and at most how many Newton steps each
-      may take; 0 starts means no polishing.
+    - `allowed`: which points may be chosen, e.g. none too close to earlier ones.
+    - `starts`, `steps`: number of candidates, at least 0.1 apart, that are refined, and the largest number of Newton
+      steps of each; 0 starts means no refinement.
     - `search`: the feasible set, as [`climb`][hilbo.numerics.climbing.climb] takes it: `space.searched`.
     """
     if allowed is not None:
@@ -127,7 +133,7 @@ def maximise(
 def thompson(
     key: PRNGKeyArray, mean: Float[Array, " m"], covariance: Float[Array, "m m"]
 ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
-    """Row of the maximum of one joint draw of f at m candidates, and the draw (m,).
+    """Index of the maximum of one joint draw of f at m candidates, and the draw (m,).
 
     `covariance` is the joint posterior covariance, (m, m); its eigenvector root needs no jitter.
     """

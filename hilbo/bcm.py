@@ -1,14 +1,14 @@
-"""Bayesian committee machine: the posteriors of M participants aggregated into one population map.
+"""Bayesian committee machine: aggregates the posteriors of M participants into one population map.
 
 Paper, section V, for one latent score with prior variance k and participants' posteriors N(mu_j, sigma_j^2):
 
     1 / sigma^2 = sum_j 1 / sigma_j^2 - (M - 1) / k,        mu = sigma^2 sum_j mu_j / sigma_j^2.
 
-It is computed as 1 / sigma^2 = 1 / k + sum_j s_j with s_j = e_j / (k (k - e_j)): the precision that person j *adds*,
-from the variance e_j = k - sigma_j^2 that the answers explain. A person without data adds exactly 0, and 100,000 weak
-experts keep the digits that a difference of two large sums would lose. The sum over people is one reduction; when
-M x m does not fit in memory, [`stream`][] makes it one expert at a time.
-Reference: Tresp (2000), Neural Computation 12:2719.
+It is computed as 1 / sigma^2 = 1 / k + sum_j s_j with s_j = e_j / (k (k - e_j)): the precision that participant j adds,
+from the variance e_j = k - sigma_j^2 that the responses explain. A participant without data adds exactly 0, and 100,000
+weak experts keep the digits that a difference of two large sums would lose. The sum over participants is one reduction;
+when M x m does not fit in memory, [`stream`][] computes it one expert at a time. Reference: Tresp (2000), Neural
+Computation 12:2719.
 """
 
 import functools
@@ -39,11 +39,11 @@ _Map = tuple[Float[Array, " m"], Float[Array, " m"]]
 """Mean and variance (m,) of the population map."""
 
 _one_program = functools.partial(jax.jit, inline=True)
-"""Decorator: called outside of any program it is one program, not one for each operation."""
+"""Decorator: compiles the whole function as one program when it is called outside of `jit`."""
 
 
 class Evidence(eqx.Module):
-    """What people add to the prior at m points, a running sum: added precision, and precision-weighted means."""
+    """Running sum of the participants' evidence at m points: added precision, and precision-weighted means."""
 
     added: Float[Array, " m"]
     weighted: Float[Array, " m"]
@@ -69,10 +69,10 @@ def combine(
     - `means`, `variances`: (M, m).
     - `prior_variance`: k, a scalar or (m,), the same for all participants.
     - `mask`: (M,), False for absent participants.
-    - `throw`: raise for means that are no numbers, for variances that are not positive, and for more variance after
-      the answers than before as a whole (no positive precision); `False` returns NaN there.
+    - `throw`: raise `InputError` for means that are not finite, for variances that are not positive, and if no positive
+      precision is left; `False` returns NaN there.
 
-    What an absent participant's rows hold has no influence. Where the explained variance is known directly,
+    The rows of an absent participant have no influence. If the explained variance is known directly,
     [`combine_explained`][] is more precise for weak experts.
     """
     means, variances, prior = _people(means, "variances", variances, prior_variance)
@@ -87,9 +87,9 @@ def combine_explained(
     mask: Numbers | None = None,
     throw: bool = True,
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """As [`combine`][], with its errors, from the variances e_j = k - sigma_j^2 that the answers explain, (M, m).
+    """Population mean and variance as [`combine`][], from the variances e_j = k - sigma_j^2 explained, (M, m).
 
-    Raises `InputError` for other shapes.
+    Raises `InputError` for other shapes, and as `combine`.
     """
     means, explained, prior = _people(means, "explained", explained, prior_variance)
     merged, invalid = _merged(means, explained, prior, _present(mask, means))
@@ -101,10 +101,10 @@ def stream(
     experts: PyTree,
     prior_variance: Float[Array, ""] | Float[Array, " m"],
 ) -> Evidence:
-    """The evidence of many experts, one after the other: a CPU's caches hold one expert's predictions.
+    """Accumulate the evidence of many experts one after the other, to limit memory use.
 
-    **Arguments:** `expert`: gives mean and explained variance (m,) of one expert; `experts`: what it is called with,
-    stacked along a leading axis of length M.
+    **Arguments:** `expert`: gives mean and explained variance (m,) of one expert; `experts`: its arguments, stacked
+    along a leading axis of length M.
     """
 
     def evidence_of(one):
@@ -119,10 +119,10 @@ def stream(
 def average(
     means: Numbers, variances: Numbers, *, mask: Numbers | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Plain average of the latent functions, for comparison (paper, section II-C): every person counts the same,
-    however little is known; mean (m,), and the variance (m,) of the mean of independent functions.
+    """Plain average of the latent functions, for comparison (paper, section II-C): all participants have equal weight.
 
-    Raises `InputError` for other shapes, and where nobody is present; if that is traced, the average is NaN.
+    Mean (m,), and the variance (m,) of the mean of independent functions. Raises `InputError` for other shapes, and if
+    no participant is present; if that is traced, the average is NaN.
     """
     means, variances, _ = _people(means, "variances", variances, 1.0)
     present = _present(mask, means)
@@ -133,8 +133,8 @@ def average(
 
 @_one_program
 def _averaged(means: Float[Array, "M m"], variances: Float[Array, "M m"], present: Bool[Array, " M"]) -> _Map:
-    """Of `average`, with arrays that were checked."""
-    means, variances = _of_those(present, means), _of_those(present, variances)
+    """Compute `average` from checked arrays."""
+    means, variances = _present_rows(present, means), _present_rows(present, variances)
     count = jnp.sum(present)
     count = jnp.where(count > 0, count.astype(means.dtype), jnp.nan)
     return jnp.sum(means, axis=0) / count, jnp.sum(variances, axis=0) / count**2
@@ -147,34 +147,38 @@ def _merged(
     prior: Float[Array, " m"],
     present: Bool[Array, " M"],
 ) -> tuple[_Map, Bool[Array, " m"]]:
-    """The map by the committee machine, NaN where it cannot be; and where that is."""
-    means, explained = _of_those(present, means), _of_those(present, explained)
+    """Population map of the committee machine, NaN at invalid points; and the mask of invalid points."""
+    means, explained = _present_rows(present, means), _present_rows(present, explained)
     evidence = _evidence(means, explained, prior)
     invalid = _invalid(means, explained, prior) | ~(1.0 + prior * evidence.added > 0.0)
     mean, variance = evidence.merge(prior)
     return (jnp.where(invalid, jnp.nan, mean), jnp.where(invalid, jnp.nan, variance)), invalid
 
 
-def _of_those(present: Bool[Array, " M"], rows: Float[Array, "M m"]) -> Float[Array, "M m"]:
-    """Rows of those who are present; of others 0, which explains nothing and adds nothing."""
+def _present_rows(present: Bool[Array, " M"], rows: Float[Array, "M m"]) -> Float[Array, "M m"]:
+    """Rows of the participants who are present; 0, which adds nothing, for the others."""
     return jnp.where(present[:, None], rows, 0.0)
 
 
 def _evidence(means: Float[Array, "M m"], explained: Float[Array, "M m"], prior: Float[Array, " m"]) -> Evidence:
+    """Evidence of the experts, summed."""
     remaining = prior[None, :] - explained
     added, weighted = explained / (prior[None, :] * remaining), means / remaining
     return Evidence(jnp.sum(added, axis=0), jnp.sum(weighted, axis=0))
 
 
 def _add(left: Evidence, right: Evidence) -> Evidence:
+    """Sum of two running sums."""
     return jax.tree.map(jnp.add, left, right)
 
 
 def _people(
     means: Numbers, name: str, others: Numbers, prior_variance: Numbers
 ) -> tuple[Float[Array, "M m"], Float[Array, "M m"], Float[Array, " m"]]:
-    """Both as arrays of one shape, and one prior for each point, all of one floating dtype. Raises `InputError` for
-    other shapes. `name`: of `others`."""
+    """Check `means`, `others` (called `name` in errors) and the prior variance; return them as arrays of one dtype.
+
+    The prior variance is broadcast to the points. Raises `InputError` for other shapes.
+    """
     dtype = np.promote_types(float_dtype(means), float_dtype(others))
     means, others = numbers("bcm", "means", means, dtype), numbers("bcm", name, others, dtype)
     if means.ndim != 2 or means.shape != others.shape:
@@ -192,7 +196,7 @@ def _people(
 
 
 def _present(mask: Numbers | None, means: Float[Array, "M m"]) -> Bool[Array, " M"]:
-    """Who is present. Raises `InputError` for what is not one flag for each participant."""
+    """Mask of the participants who are present. Raises `InputError` for a mask of another shape or type."""
     if mask is None:
         return to_device(np.ones(means.shape[0], bool))
     flags = numbers("bcm", "mask", mask)
@@ -207,11 +211,12 @@ def _present(mask: Numbers | None, means: Float[Array, "M m"]) -> Bool[Array, " 
 def _invalid(
     means: Float[Array, "M m"], explained: Float[Array, "M m"], prior: Float[Array, " m"]
 ) -> Bool[Array, " m"]:
-    """Points at which some expert's mean is no number, or some variance is not positive (or no number)."""
+    """Points at which some expert's mean is not finite, or some variance is not positive."""
     return jnp.any(~jnp.isfinite(means) | ~(prior[None, :] - explained > 0.0), axis=0)
 
 
 def _raise_if(invalid: Bool[Array, " m"], merged: _Map) -> _Map:
+    """Return the map; raise `InputError` (under `jit` an equinox error) if a point is invalid."""
     message = (
         "bcm: an expert's mean is no number, a variance is not positive, or the experts' variances exceed the prior's"
         " so far that no positive precision is left; check that prior_variance is the one all experts were fitted with"

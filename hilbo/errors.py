@@ -1,11 +1,11 @@
-"""The one exception that means "the person who gave this input can fix it", and the one warning about an input."""
+"""The exception for invalid input that the user can correct, and the warning about ambiguous input."""
 
 import sys
 import warnings
 
 __all__ = ["InputError", "InputRemark", "warn_caller"]
 
-_INSIDE = {"hilbo", "equinox", "jaxtyping", "beartype"}  # between the user's line and the place that warns
+_INSIDE = {"hilbo", "equinox", "jaxtyping", "beartype"}  # packages whose frames are skipped
 
 
 def __dir__() -> list[str]:
@@ -21,11 +21,11 @@ class InputError(ValueError):
 
 
 class InputRemark(UserWarning):
-    """How an input was understood where it could be understood otherwise: one sentence, with the place."""
+    """Warning about how an ambiguous input was interpreted: one sentence, with the place."""
 
 
 def warn_caller(sentence: str) -> None:
-    """An `InputRemark` that names the user's own line: the nearest one outside hilbo and what wraps its functions."""
+    """Issue an `InputRemark` attributed to the nearest caller outside hilbo and the packages wrapping its functions."""
     level, frame = 1, sys._getframe()
     while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
         level, frame = level + 1, frame.f_back

@@ -1,4 +1,4 @@
-"""What `hilbo.fit` refuses: a model and answers that do not fit together, with what to do; and what it remarks."""
+"""Checks of the input of `hilbo.fit`: shapes of model and responses, categories, and points outside the unit cube."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,11 +11,11 @@ from hilbo.trials import Trials
 
 __all__ = ["check_answers", "check_shapes", "remark_outside"]
 
-_ROUNDING = 1e-3  # beyond the unit cube that is no remark
+_ROUNDING = 1e-3  # tolerance beyond the unit cube without a remark
 
 
 def check_shapes(kernel: Kernel, likelihood: OrdinalProbit, trials: Trials, start: Float[Array, "..."] | None) -> None:
-    """Raises `InputError` for shapes of model, answers and start that do not belong together."""
+    """Raise `InputError` if the shapes of model, responses and `start` do not match."""
     if trials.mask.ndim != 1:
         raise InputError(
             f"fit: these trials hold {len(trials.mask)} people; fit those of one, or use jax.vmap with throw=False."
@@ -30,6 +30,7 @@ def check_shapes(kernel: Kernel, likelihood: OrdinalProbit, trials: Trials, star
 
 
 def _check_kernel(kernel: Stationary, dim: int) -> None:
+    """Raise `InputError` if the kernel's parameters do not match the dimension of the points."""
     if jnp.shape(kernel.theta) not in ((), (dim,)):
         raise InputError(
             f"fit: theta has shape {jnp.shape(kernel.theta)} and x {dim} parameters; give one number or {dim}."
@@ -41,7 +42,7 @@ def _check_kernel(kernel: Stationary, dim: int) -> None:
 
 
 def check_answers(trials: Trials, categories: int) -> None:
-    """Raises `InputError` for answers that no model of so many categories takes; for values that are known."""
+    """Raise `InputError` for points that are not finite, and for responses outside the categories; for known values."""
     finite, q = np.isfinite(trials.x).all(axis=-1), np.asarray(trials.q)
     if not finite.all():
         row = int(np.argmin(finite))
@@ -54,9 +55,11 @@ def check_answers(trials: Trials, categories: int) -> None:
 
 
 def remark_outside(whose: str, kernel: Kernel, points: Float[np.ndarray, "n d"]) -> None:
-    """Warn of known points (n, d) that lie outside the unit cube by more than rounding, such as those in physical
-    units: answers there hardly depend on each other, and predictions are the prior. Only of the kernels that see a
-    study's points alone."""
+    """Warn of points (n, d) outside the unit cube by more than rounding, such as those in physical units.
+
+    Responses there are almost independent, and predictions are the prior. Only for stationary kernels; `whose` begins
+    the warning.
+    """
     if not isinstance(kernel, Stationary):
         return
     outside = np.abs(points - 0.5).max(axis=-1, initial=0.0) > 0.5 + _ROUNDING

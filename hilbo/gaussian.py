@@ -1,7 +1,7 @@
-"""The Gaussian that approximates a posterior: N(K a, K - K C K), C = (K + 1/W)^-1, and the algebra it takes.
+"""Gaussian approximation of a posterior, N(K a, K - K C K) with C = (K + 1/W)^-1, and its linear algebra.
 
 Laplace's method and expectation propagation end in this form, W being curvatures or the precisions of sites. K is never
-inverted, nothing is added to it, and W = 0 (padding, or an answer that says nothing) is no special case. At new points,
+inverted, nothing is added to it, and W = 0 (padding, or an uninformative response) is no special case. At new points,
 `k*` the prior covariances with eta, the mean is `k*'a` and the variance `k - k*'C k*`.
 """
 
@@ -40,17 +40,17 @@ def __dir__() -> list[str]:
 
 
 Terms = TypeVar("Terms")
-_NATS, _SHARE = 0.02, 1e-5  # of a log evidence, which nobody reads more closely
-_WAYS = np.array([3.0, 5.0, 7.0, 11.0])  # to multiply by and to divide by, which rounds
+_NATS, _SHARE = 0.02, 1e-5  # absolute and relative tolerance of a log evidence
+_ROUNDING_FACTORS = np.array([3.0, 5.0, 7.0, 11.0])  # factors to multiply and divide by, to provoke rounding
 
 
 class Certificate(eqx.Module):
-    """What a fit can say of its own accuracy; every number is measured, none assumed."""
+    """Convergence diagnostics of a fit; every number is measured."""
 
     residual: Float[Array, ""]
     """|R' grad l - v| at the mode: a bound on its distance from the exact mode, in prior standard deviations."""
     tolerance: Float[Array, ""]
-    """What the residual had to reach: eps^(2/3), or the rounding error of the residual itself where that is larger."""
+    """Tolerance of the residual: eps^(2/3), or the rounding error of the residual itself if that is larger."""
     iterations: Int[Array, ""]
     """Newton steps taken, rejected ones included."""
     jitter: Float[Array, ""]
@@ -58,15 +58,15 @@ class Certificate(eqx.Module):
     condition: Float[Array, ""]
     """Upper bound on the condition number of I + W^(1/2) K W^(1/2), the only matrix that is factorised."""
     smallest_variance: Float[Array, ""]
-    """Smallest posterior variance among the eta's that the data say anything about."""
+    """Smallest posterior variance among the eta's with informative data."""
     variance_resolution: Float[Array, ""]
     """Rounding error to expect in a posterior variance: eps * largest prior variance * sqrt(n)."""
     evidence_error: Float[Array, ""]
-    """What the distance from the exact mode, and the rounding of K a, do to the log evidence, to first order."""
+    """Error of the log evidence due to the distance from the exact mode and the rounding of K a, to first order."""
     evidence_tolerance: Float[Array, ""]
-    """0.02 + eps^(1/2) |log evidence|: evidences that are nearer than that decide nothing."""
+    """Tolerance of the evidence error: 0.02 + eps^(1/2) |log evidence|."""
     evidence_rounding: Float[Array, ""]
-    """What the rounding of K itself does to the log evidence."""
+    """Error of the log evidence due to the rounding of K."""
     converged: Bool[Array, ""]
     """residual <= tolerance, evidence_error <= evidence_tolerance, evidence_error + evidence_rounding <= 0.02 +
     max(eps^(1/2), 1e-5) |log evidence|, no variance below its resolution, all finite."""
@@ -104,12 +104,11 @@ def certify(
     log_evidence: Float[Array, ""],
     **search: Any,
 ) -> Certificate:
-    """The certificate of the posterior with these `weights` a, this `curvature` W and `factor` V; `search` says how it
-    was found.
+    """Compute the certificate of the posterior with these `weights` a, `curvature` W and `factor` V.
 
-    K a, which predictions use, and the mode are equal but for rounding, and may differ by eps^(1/4) prior standard
-    deviations.
-    `covariance` and `factor` (n, n); `mode`, `weights` and `curvature` (n,).
+    `search`: diagnostics of the search, such as residual and tolerance. K a, which predictions use, and the mode are
+    equal except for rounding, and may differ by eps^(1/4) prior standard deviations. `covariance` and `factor` (n, n);
+    `mode`, `weights` and `curvature` (n,).
     """
     epsilon, prior = jnp.finfo(weights.dtype).eps, jnp.diagonal(covariance)
     largest, sd = jnp.max(prior), jnp.sqrt(prior)
@@ -141,40 +140,39 @@ def evidence_error(
     posterior: tuple[Float[Array, " n"], Callable[[Float[Array, "n k"]], Float[Array, "n k"]]],
     curvature_at: Callable[[Float[Array, " n"]], Float[Array, " n"]],
 ) -> Float[Array, ""]:
-    """How far off Laplace's log evidence may be at this `mode`, with `weights` a and `curvature` W there.
+    """Error of Laplace's log evidence due to an inexact `mode`, with `weights` a and `curvature` W there.
 
-    `posterior`: variances, and what multiplies by C.
+    `posterior`: variances, and a function that multiplies by C.
 
-    To first order the mode is off by d = P (K a - mode), P = (I + KW)^-1 = I - K C, beside the rounding
-    P eps |K| |a| + eps |mode|. The log posterior being stationary, the sums in the log evidence move by at most
-    sum W d^2 / 2; log|I + KW| / 2 moves by sum s dW / 2, s being the posterior variances, dW the change of the
-    curvatures within d. Where the noise is far below the prior's standard deviation, these notice what a residual in
-    units of the latter cannot.
-    `covariance` (n, n); `mode`, `weights` and `curvature` (n,) -> a scalar, in nats.
+    To first order the mode has the error d = P (K a - mode), P = (I + KW)^-1 = I - K C, plus the rounding P eps |K| |a|
+    + eps |mode|. The log posterior being stationary, the sums in the log evidence change by at most sum W d^2 / 2;
+    log|I + KW| / 2 changes by sum s dW / 2, s being the posterior variances, dW the change of the curvatures within d.
+    Where the noise is far below the prior's standard deviation, this detects errors that a residual in units of the
+    latter cannot. `covariance` (n, n); `mode`, `weights` and `curvature` (n,) -> a scalar, in nats.
     """
-    epsilon, (variance, explain) = jnp.finfo(weights.dtype).eps, posterior
+    epsilon, (variance, multiply_by_C) = jnp.finfo(weights.dtype).eps, posterior
     rounding = epsilon * (jnp.abs(covariance) @ jnp.abs(weights))
     steps = jnp.stack([mode - covariance @ weights, rounding], axis=1)
-    off = jnp.sum(jnp.abs(steps - covariance @ explain(steps)), axis=1) + epsilon * jnp.abs(mode)
-    below, above = jax.vmap(curvature_at)(jnp.stack([mode - off, mode + off]))
+    mode_error = jnp.sum(jnp.abs(steps - covariance @ multiply_by_C(steps)), axis=1) + epsilon * jnp.abs(mode)
+    below, above = jax.vmap(curvature_at)(jnp.stack([mode - mode_error, mode + mode_error]))
     change = jnp.maximum(jnp.abs(below - curvature), jnp.abs(above - curvature))
-    return 0.5 * (jnp.sum(curvature * off**2) + jnp.sum(jnp.abs(variance) * change))
+    return 0.5 * (jnp.sum(curvature * mode_error**2) + jnp.sum(jnp.abs(variance) * change))
 
 
 def evidence_rounding(covariance: Float[Array, "n n"], weights: Float[Array, "k n"]) -> Float[Array, ""]:
-    """What the rounding of K does to the sum of a'K a / 2 over the rows a of `weights`.
+    """Error in the sum of a'K a / 2 over the rows a of `weights` due to the rounding of K.
 
-    Equal elements of K are rounded in the same way, so that answers which contradict each other at one place lose
-    nothing. So K is rounded once more, in several ways, and the differences are what is counted.
-    `covariance` (n, n), `weights` (k, n) -> a scalar, in nats.
+    Estimated by rounding K once more in several ways, and taking the differences. Equal elements of K are rounded
+    alike, so contradictory responses at one point cause no error. `covariance` (n, n), `weights` (k, n) -> a scalar, in
+    nats.
     """
-    ways = jnp.asarray(_WAYS, weights.dtype)[:, None, None]
-    rounded = covariance[None, :, :] * ways / ways - covariance[None, :, :]
+    factors = jnp.asarray(_ROUNDING_FACTORS, weights.dtype)[:, None, None]
+    rounded = covariance[None, :, :] * factors / factors - covariance[None, :, :]
     return 0.5 * jnp.linalg.norm(jnp.einsum("ki,wij,kj->w", weights, rounded, weights))
 
 
 def evidence_known(value: Float[Array, ""], error: Float[Array, ""], rounding: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether a log evidence with this `error` and `rounding` is finite and close enough (see [`Certificate`][]).
+    """Whether a log evidence with this `error` and `rounding` is finite and accurate enough (see [`Certificate`][]).
 
     All are scalars, in nats.
     """
@@ -184,13 +182,15 @@ def evidence_known(value: Float[Array, ""], error: Float[Array, ""], rounding: F
 
 
 def evidence_tolerance(log_evidence: Float[Array, ""]) -> Float[Array, ""]:
-    """How far off the search may leave a log evidence: 0.02 + eps^(1/2) |log evidence|. Scalars, in nats."""
+    """Tolerance of a log evidence: 0.02 + eps^(1/2) |log evidence|. Scalars, in nats."""
     return _NATS + jnp.finfo(log_evidence.dtype).eps ** 0.5 * jnp.abs(log_evidence)
 
 
 def shortfall(certificate: Any, log_evidence: Float[Array, ""]) -> str:
-    """What a certificate that does not hold says, in words, and what may help. A sampled posterior's has a residual,
-    and says no by that alone."""
+    """Message on why a certificate is not converged, with possible remedies.
+
+    `certificate` may be that of a sampled posterior.
+    """
     remedy, residual = "use a larger noise, float64", f"{float(certificate.residual):.3g}"
     if not bool(certificate.residual <= certificate.tolerance) and not bool(jnp.isnan(certificate.tolerance)):
         steps, tolerance = int(certificate.iterations), float(certificate.tolerance)
@@ -218,7 +218,7 @@ def shortfall(certificate: Any, log_evidence: Float[Array, ""]) -> str:
 
 
 def still(terms: Terms) -> Terms:
-    """The terms without derivatives in their arrays."""
+    """Copy of the terms without derivatives by their arrays (`stop_gradient`)."""
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, terms)
 
 
@@ -226,9 +226,9 @@ def still(terms: Terms) -> Terms:
 def mean_and_explained(
     weights: Float[Array, " n"], factor: Float[Array, "n n"], inverse: Float[Array, "n n"], cross: Float[Array, "n m"]
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Posterior mean `k*'a` at m points, and `k*'C k*`, the prior variance less the posterior's.
+    """Posterior mean `k*'a` at m points, and the explained variance `k*'C k*`: prior minus posterior variance.
 
-    The latter is a sum of squares: never negative, with all its digits however little is explained.
+    The latter is a sum of squares: never negative, and without cancellation.
 
     **Arguments:** `weights`, `factor` and `inverse` of a posterior; `cross`, prior covariances (n, m) of eta and f*.
     """
@@ -242,6 +242,7 @@ def mean_and_explained(
 def _mean_and_explained_jvp(
     primals: tuple[Array, ...], tangents: tuple[Array, ...]
 ) -> tuple[tuple[Float[Array, " m"], Float[Array, " m"]], tuple[Float[Array, " m"], Float[Array, " m"]]]:
+    """Derivative by weights, inverse and covariances."""
     weights, _, inverse, cross = primals
     d_weights, _, d_inverse, d_cross = tangents
     d_mean = d_weights @ cross + weights @ d_cross
@@ -252,10 +253,9 @@ def _mean_and_explained_jvp(
 def square_root(covariance: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
     """R with R R' = K, and the largest element of R R' - K.
 
-    One Cholesky step takes out what all eta's share, which is most of a large K; the eigenvectors of the rest are found
-    to eps times a much smaller norm. What is left is positive semi-definite, so a negative eigenvalue is rounding and
-    is dropped; what that and all other rounding did to K is measured, as the product says.
-    (n, n) -> (n, n) and a scalar.
+    One Cholesky step removes the component common to all eta's, the largest part of a large K; the eigenvectors of the
+    rest are found to eps times a much smaller norm. The rest is positive semi-definite, so negative eigenvalues are
+    rounding errors and set to 0; the resulting change of K is measured. (n, n) -> (n, n) and a scalar.
     """
     first = covariance[0, 0]
     shared = covariance[:, 0] / jnp.sqrt(jnp.where(first > 0, first, 1.0))
@@ -282,7 +282,9 @@ def factorise(
 def factor(
     covariance: Float[Array, "n n"], curvature: Float[Array, " n"]
 ) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
-    """V = L^-1 W^(1/2) with B = L L', so V'V = C; and a bound on B's condition, as B has no eigenvalue below 1.
+    """V = L^-1 W^(1/2) with B = L L', so V'V = C.
+
+    And an upper bound on B's condition number (its eigenvalues are >= 1).
 
     `covariance` (n, n), `curvature` (n,) -> (n, n) and a scalar.
     """

@@ -1,16 +1,15 @@
-"""Covariance functions, written for single points; `gram` makes matrices of them by `vmap`.
+"""Covariance functions of single points; `gram` builds matrices of them by `vmap`.
 
     RBF:          k(x, x') = variance * exp(-theta |x - x'|^2)          (paper, section IV-3, with variance 1)
     Matern 3/2:   k(x, x') = variance * (1 + s) exp(-s),  s^2 = 6 theta |x - x'|^2
 
-`theta` is one number, or one per dimension (automatic relevance determination). In terms of a length scale l,
-theta = 1 / (2 l^2) for both. A coordinate may be one of k unordered levels, at 0, 1/(k-1), ..., 1: its part of
-theta |x - x'|^2 is theta where the levels differ, whichever they are, and 0 where they are the same. That is the
-squared distance of corners of a simplex, so that the covariance stays positive definite.
+`theta` is one number, or one per dimension (automatic relevance determination). In terms of a length scale l, theta = 1
+/ (2 l^2) for both. A coordinate may be categorical with k unordered levels, at 0, 1/(k-1), ..., 1: its part of theta |x
+- x'|^2 is theta for different levels and 0 for equal ones. That is the squared distance of corners of a simplex, so
+that the covariance stays positive definite.
 
 Functions of the RBF are smooth everywhere; those of the Matern kernel have a slope everywhere and may bend sharply, as
-a dissimilarity that grows with the distance does where it is smallest.
-Reference: Rasmussen & Williams (2006), section 4.2.1.
+a dissimilarity that grows with the distance does at its minimum. Reference: Rasmussen & Williams (2006), section 4.2.1.
 """
 
 import math
@@ -35,7 +34,7 @@ def __dir__() -> list[str]:
 
 @runtime_checkable
 class Kernel(Protocol):
-    """What the rest of hilbo asks of a covariance function."""
+    """Interface of a covariance function."""
 
     def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"], /) -> Float[Array, ""]:
         """Covariance of the latent function at two points."""
@@ -56,9 +55,9 @@ class RBF(eqx.Module):
 
     - `theta`: inverse squared length, > 0, scalar or (d,), per squared unit of x.
     - `variance`: prior variance of the latent function, > 0.
-    - `levels`: for each coordinate its number of unordered levels, 0 for numbers; left out, all are numbers.
+    - `levels`: for each coordinate its number of unordered levels, 0 for a numeric one; default: all numeric.
 
-    Raises `InputError` for numbers that are not above 0; what is traced cannot be refused, and below 0 gives NaN.
+    Raises `InputError` for numbers that are not above 0; traced negative numbers give NaN.
     """
 
     theta: Float[Array, "*d"]
@@ -77,7 +76,7 @@ class RBF(eqx.Module):
         return f"RBF({_numbers_shown(self)})"
 
     def with_numbers(self, theta: ArrayLike, variance: ArrayLike) -> "RBF":
-        """The same kind of kernel, of the same levels, with another theta, a scalar or (d,), and variance, a scalar."""
+        """Kernel of the same kind and levels with another theta, a scalar or (d,), and variance, a scalar."""
         return RBF(theta, variance, self.levels)
 
     def __call__(self, x: Shaped[Array, " d"], y: Shaped[Array, " d"]) -> Float[Array, ""]:
@@ -86,22 +85,20 @@ class RBF(eqx.Module):
         return _possible(self.variance).astype(x.dtype) * jnp.exp(-_squared(self, x, y))
 
     def along(self, axis: int, x: Shaped[Array, " n"], y: Shaped[Array, " m"]) -> Float[Array, "n m"]:
-        """The factor (n, m) that one coordinate of numbers contributes: the kernel is the product of these and the
-        variance."""
+        """Factor (n, m) of one numeric coordinate: the kernel is the product of these factors and the variance."""
         theta = self.theta[axis] if self.theta.ndim else self.theta
         x, y = floats(x, theta.dtype), floats(y, theta.dtype)
         return jnp.exp(-_possible(theta).astype(x.dtype) * (x[:, None] - y[None, :]) ** 2)
 
     def diagonal(self, x: Shaped[Array, " d"]) -> Float[Array, ""]:
-        """The prior variance, the same everywhere. `x` (d,) -> a scalar."""
+        """Prior variance at a point, which is constant. `x` (d,) -> a scalar."""
         return _possible(self.variance).astype(floats(x, self.variance.dtype).dtype)
 
 
 class Matern32(eqx.Module):
     """Matern covariance of smoothness 3/2, variance * (1 + s) exp(-s) with s^2 = 6 theta |x - x'|^2.
 
-    Arguments and errors as those of `RBF`, theta a scalar or (d,). Twice differentiable in each point, also where both
-    are the same.
+    Arguments and errors as for `RBF`. Twice differentiable in each point, also where both are equal.
     """
 
     theta: Float[Array, "*d"]
@@ -120,7 +117,7 @@ class Matern32(eqx.Module):
         return f"Matern32({_numbers_shown(self)})"
 
     def with_numbers(self, theta: ArrayLike, variance: ArrayLike) -> "Matern32":
-        """The same kind of kernel, of the same levels, with another theta, a scalar or (d,), and variance, a scalar."""
+        """Kernel of the same kind and levels with another theta, a scalar or (d,), and variance, a scalar."""
         return Matern32(theta, variance, self.levels)
 
     def __call__(self, x: Shaped[Array, " d"], y: Shaped[Array, " d"]) -> Float[Array, ""]:
@@ -129,23 +126,23 @@ class Matern32(eqx.Module):
         return _possible(self.variance).astype(x.dtype) * _matern32(6.0 * _squared(self, x, y))
 
     def diagonal(self, x: Shaped[Array, " d"]) -> Float[Array, ""]:
-        """The prior variance, the same everywhere. `x` (d,) -> a scalar."""
+        """Prior variance at a point, which is constant. `x` (d,) -> a scalar."""
         return _possible(self.variance).astype(floats(x, self.variance.dtype).dtype)
 
 
 Stationary = RBF | Matern32
-"""Kernels of the distance theta |x - x'|^2 alone."""
+"""Kernels that depend only on the distance theta |x - x'|^2."""
 
 
 class Levels(NamedTuple):
-    """A coordinate of unordered levels: how many, and the correlation of the latent function at two of them."""
+    """Categorical coordinate: number of unordered levels, and correlation of the latent function between two."""
 
     count: int
     correlation: float
 
 
 def theta_of(kernel: type[Stationary], correlation: float) -> float:
-    """The theta of a coordinate of levels at which two of them have this correlation, all else being equal.
+    """theta of a categorical coordinate for which two levels have this correlation, other coordinates being equal.
 
     `correlation`: above 0 and below 1.
     """
@@ -158,8 +155,10 @@ def theta_of(kernel: type[Stationary], correlation: float) -> float:
 
 
 def embedded(kernel: Stationary, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n e"]:
-    """Points (n, d) in coordinates (n, e) in which the kernel's squared distance is the Euclidean one: numbers times
-    the root of theta, and of k levels k coordinates, one of which is not 0."""
+    """Map points (n, d) to coordinates (n, e) in which the kernel's squared distance is Euclidean.
+
+    Numeric coordinates times the root of theta; a coordinate of k levels becomes k coordinates, one of which is not 0.
+    """
     theta = np.broadcast_to(np.asarray(kernel.theta), x.shape[1])
     columns = []
     for i, count in enumerate(kernel.levels or (0,) * x.shape[1]):
@@ -171,18 +170,21 @@ def embedded(kernel: Stationary, x: Float[np.ndarray, "n d"]) -> Float[np.ndarra
 
 
 def _numbers_shown(kernel: Stationary) -> str:
+    """Parameters of a kernel for its repr."""
     levels = f", levels={kernel.levels}" if kernel.levels else ""
     return f"theta={shown(kernel.theta)}, variance={shown(kernel.variance)}{levels}"
 
 
 def _possible(value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """A kernel's number, NaN below 0: what is traced cannot be refused, and exp(+|x - x'|^2) is no covariance."""
+    """Parameter of a kernel, NaN below 0, since traced values cannot be refused."""
     return jnp.where(value < 0, jnp.nan, value)
 
 
 def _squared(kernel: Stationary, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
-    """theta |x - y|^2, summed coordinate by coordinate: under vmap this becomes one fused loop over pairs, about three
-    times faster than a reduction over an axis of length d, and it keeps the digits that |x|^2 + |y|^2 - 2xy would lose.
+    """Scaled squared distance theta |x - y|^2, summed coordinate by coordinate.
+
+    Under vmap this becomes one fused loop over pairs, about three times faster than a reduction over an axis of length
+    d, and it avoids the cancellation in |x|^2 + |y|^2 - 2xy.
     """
     theta = jnp.broadcast_to(_possible(kernel.theta), x.shape).astype(x.dtype)
     counts = kernel.levels or (0,) * x.shape[0]
@@ -196,12 +198,13 @@ def _squared(kernel: Stationary, x: Float[Array, " d"], y: Float[Array, " d"]) -
     return sum((part(i) for i in range(1, x.shape[0])), part(0))
 
 
-# With r = s^2 the correlation has the slope -exp(-s) / 2, and that has exp(-s) / (4 s): infinite where both points are
-# the same, where it is multiplied by the slope of r, which is 0. Both are written down, so that AD meets no 0 * inf.
+# With r = s^2 the correlation has the slope -exp(-s) / 2, whose slope exp(-s) / (4 s) is infinite for equal points,
+# where it is multiplied by the slope of r, which is 0. Explicit rules avoid 0 * inf in automatic differentiation.
 
 
 @jax.custom_jvp
 def _matern32(r: Float[Array, ""]) -> Float[Array, ""]:
+    """Correlation (1 + s) exp(-s) as a function of r = s^2."""
     root = jnp.sqrt(r)
     return (1.0 + root) * jnp.exp(-root)
 
@@ -213,6 +216,7 @@ def _matern32_jvp(primals, tangents):
 
 @jax.custom_jvp
 def _matern32_slope(r: Float[Array, ""]) -> Float[Array, ""]:
+    """Derivative of `_matern32` by r: -exp(-s) / 2."""
     return -0.5 * jnp.exp(-jnp.sqrt(r))
 
 

@@ -1,21 +1,21 @@
 """Laplace approximation for latent values with a Gaussian prior and a sum of pointwise log-likelihood terms.
 
-Model: eta ~ N(0, K), log p(data | eta) = sum_i l_i(eta_i), each l_i concave. The terms may look at anything linear in
-the latent function: an answer at x_i has eta_i = f(x_i), a preference between two stimuli eta_i = f(x_i) - f(x_i');
-K is the prior covariance of the eta's, of whatever rank (the same stimulus asked twice makes it singular).
+Model: eta ~ N(0, K), log p(data | eta) = sum_i l_i(eta_i), each l_i concave. The terms may depend on any linear
+functional of the latent function: a response at x_i has eta_i = f(x_i), a preference between two stimuli eta_i = f(x_i)
+- f(x_i'); K is the prior covariance of the eta's, of any rank (repeated stimuli make it singular).
 
-* Coordinates. eta = R v with v ~ N(0, I) and R the symmetric-eigenvector root of K, so K is never inverted and needs
-  no jitter. The Newton matrix I + R'WR has no eigenvalue below 1, and the objective is strongly concave with modulus
-  1: the residual |R' grad l - v| *bounds* the distance to the mode, in units of the prior's standard deviations.
-* The search begins with full Newton steps on the weights a, eta = K a (R & W, algorithm 3.1), which need no R: there
-  v = R'a and the same residual is sqrt(r'Kr), r = grad l - a. Where they do not end below the tolerance, because the
-  answers conflict at little noise, say, the search begins anew in v, where every start converges: the steps are damped
-  by Armijo's rule (`hilbo.newton_steps`).
-* Derivatives of any order come from the stationarity eta = K grad l(eta) by the implicit function theorem, and from
-  C = (K + 1/W)^-1 written so that W = 0 is no special case. R, whose derivative may not exist, has no part in them.
+- Coordinates. eta = R v with v ~ N(0, I) and R the symmetric-eigenvector root of K, so K is never inverted and needs no
+  jitter. The Newton matrix I + R'WR has no eigenvalue below 1, and the objective is strongly concave with modulus 1:
+  the residual |R' grad l - v| *bounds* the distance to the mode, in units of the prior's standard deviations.
+- The search begins with full Newton steps on the weights a, eta = K a (R & W, algorithm 3.1), which need no R: there v
+  = R'a and the same residual is sqrt(r'Kr), r = grad l - a. If they do not converge, e.g. for contradictory responses
+  with little noise, the search restarts in v, where it converges from every start: the steps are damped by Armijo's
+  rule (`hilbo.newton_steps`).
+- Derivatives of any order come from the stationarity eta = K grad l(eta) by the implicit function theorem, and from C =
+  (K + 1/W)^-1 written so that W = 0 is no special case. R, whose derivative may not exist, is not differentiated.
 
-Evidence: log q(data) = sum l - a'eta/2 - log|I + KW|/2, a = grad l(eta) at the mode.
-References: Rasmussen & Williams (2006), sections 3.4 and 5.5.1; paper, section IV-1.
+Evidence: log q(data) = sum l - a'eta/2 - log|I + KW|/2, a = grad l(eta) at the mode. References: Rasmussen & Williams
+(2006), sections 3.4 and 5.5.1; paper, section IV-1.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ _PLAIN_STEPS, _STEPS = 20, 200
 
 
 class Pointwise(eqx.Module):
-    """Terms of which only the values are given, (n,) -> (n,) elementwise: slopes and curvatures by differentiation."""
+    """Terms given by their values alone, (n,) -> (n,) elementwise; slopes and curvatures by differentiation."""
 
     log_likelihood: Callable[[Float[Array, " n"]], Float[Array, " n"]]
 
@@ -110,7 +110,7 @@ def laplace(
 
 
 class Mode(NamedTuple):
-    """The mode, its residual and the tolerance that was to be met, steps taken, and what the square root dropped."""
+    """Mode, its residual and tolerance, number of steps, and change of K by its square root."""
 
     eta: Float[Array, " n"]
     residual: Float[Array, ""]
@@ -121,10 +121,10 @@ class Mode(NamedTuple):
 
 @eqx.filter_custom_jvp
 def find_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
-    """The mode, sought from weights `start` and then, if need be, from 0.
+    """Find the mode from weights `start`, or if that fails from 0.
 
-    Under `vmap` one matrix after the other on CPUs, each stopping when it is done; elsewhere all at once in v.
-    `covariance` (n, n), `start` (n,).
+    Under `vmap` the problems are solved one by one on CPUs, each stopping when it has converged; elsewhere all at once
+    in v. `covariance` (n, n), `start` (n,).
     """
     arrays, rest = eqx.partition(terms, eqx.is_array)
 
@@ -140,7 +140,10 @@ def find_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array,
 
 
 def plain_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
-    """Full Newton steps on the weights, as long as the log posterior rises. `covariance` (n, n), `start` (n,)."""
+    """Find the mode by full Newton steps on the weights, as long as the log posterior rises.
+
+    `covariance` (n, n), `start` (n,).
+    """
     import optimistix as optx  # slow to import, and needed only where a fit is traced
 
     from hilbo.newton_steps import FullNewton
@@ -152,7 +155,7 @@ def plain_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array
 
 
 def _whitened_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
-    """Damped Newton steps in v, from the weights `start`."""
+    """Find the mode by damped Newton steps in v, from the weights `start`."""
     import optimistix as optx  # slow to import, and needed only where a fit is traced
 
     from hilbo.newton_steps import DampedNewton
@@ -174,7 +177,7 @@ def _whitened_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[A
 
 @find_mode.def_jvp
 def find_mode_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Mode, Mode]:
-    """eta = K grad l(eta), hence (I + K W) d eta = d(K grad l) at fixed eta, and (I + K W)^-1 = I - K C."""
+    """Derivative of the mode: (I + K W) d eta = d(K grad l) at fixed eta, and (I + K W)^-1 = I - K C."""
     terms, covariance, _, _ = primals
     mode = find_mode(*primals)
 
@@ -189,6 +192,6 @@ def find_mode_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> 
 
 
 def _stationarity(eta: Float[Array, " n"], args: tuple[Terms, Float[Array, "n n"]]) -> Float[Array, " n"]:
-    """eta - K grad l(eta), zero at the mode: what the solver is asked for."""
+    """eta - K grad l(eta), which is 0 at the mode."""
     terms, covariance = args
     return eta - covariance @ terms(eta)[1]

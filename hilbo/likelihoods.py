@@ -1,13 +1,13 @@
 """Ordinal probit likelihood: log p(q | f), its derivatives and class probabilities, exact in both tails.
 
-An answer in category j says that y = f + noise * e, e ~ N(0, 1), fell between two thresholds (paper, section IV-1):
+A response in category j means that y = f + noise * e, e ~ N(0, 1), lies between two thresholds (paper, section IV-1):
 
     p(q = j | f) = Phi(b) - Phi(a),   a = (t_{j-1} - f) / noise,   b = (t_j - f) / noise.
 
-z = (y - f) / noise is then a standard normal truncated to (a, b), and log p and all its derivatives are made of that
-normal's mass and cumulants (`hilbo.numerics.truncated_normal`). Inference sees the answers as terms, one for each row
-of a table of trials: `OrdinalTerms` at latent values, `TiltedTerms` averaged over normals.
-Reference: Chu & Ghahramani (2005), JMLR 6:1019.
+z = (y - f) / noise is then a standard normal truncated to (a, b), and log p and all its derivatives are functions of
+that normal's mass and cumulants (`hilbo.numerics.truncated_normal`). Inference receives the responses as terms, one for
+each row of a table of trials: `OrdinalTerms` at latent values, `TiltedTerms` averaged over normals. Reference: Chu &
+Ghahramani (2005), JMLR 6:1019.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ def __dir__() -> list[str]:
 
 
 def _rising(thresholds: np.ndarray) -> bool:
-    """Whether there is one threshold at least, all are finite, and each is above the one before; for several people."""
+    """Whether there is at least one threshold, and all are finite and increasing; over all participants."""
     not_empty = thresholds.ndim > 0 and thresholds.shape[-1] > 0
     return bool(not_empty and np.all(np.isfinite(thresholds)) and np.all(np.diff(thresholds) > 0))
 
@@ -45,8 +45,8 @@ class OrdinalProbit(eqx.Module):
     - `thresholds`: increasing numbers (C - 1,), in units of the latent f; the outermost categories are unbounded.
     - `noise`: standard deviation c_o > 0 of the classification noise, in units of f.
 
-    Raises `InputError` for thresholds that do not rise and a noise that is not above 0. What is traced is not checked:
-    there such values give NaN, never a plausible number.
+    Raises `InputError` for thresholds that do not increase and a noise that is not above 0. Traced values are not
+    checked; invalid ones give NaN.
     """
 
     thresholds: Float[Array, " edges"]
@@ -78,7 +78,7 @@ class OrdinalProbit(eqx.Module):
         return truncated_normal(f, lower, upper, noise).log_mass
 
     def expand(self, f: ArrayLike, q: ArrayLike) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """log p(q | f), its derivative in `f`, and minus its second derivative (in [0, 1 / noise^2]), at one price.
+        """log p(q | f), its derivative in `f`, and minus its second derivative (in [0, 1 / noise^2]).
 
         All are scalars; `jax.vmap` for several.
         """
@@ -89,12 +89,12 @@ class OrdinalProbit(eqx.Module):
     def smoothed(
         self, mean: ArrayLike, variance: ArrayLike, q: ArrayLike
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """log of the integral of p(q | f) over f ~ N(mean, variance), its derivative in `mean`, and the precision t of
-        the Gaussian site with which that normal would get the variance that the answer gives it.
+        """Log of the integral of p(q | f) over f ~ N(mean, variance), its derivative in `mean`, and site precision t.
 
-        The integral is the same likelihood with its noise grown to s, s^2 = noise^2 + variance; minus the second
-        derivative in `mean` is t / (1 + variance t). With k_2 the variance of the truncated normal,
-        t = (1 - k_2) / (noise^2 + variance k_2): never negative, at most 1 / noise^2.
+        t is the precision of the Gaussian site that gives that normal the variance of the tilted distribution. The
+        integral is the same likelihood with its noise grown to s, s^2 = noise^2 + variance; minus the second derivative
+        in `mean` is t / (1 + variance t). With k_2 the variance of the truncated normal, t = (1 - k_2) / (noise^2 +
+        variance k_2): never negative, at most 1 / noise^2.
         """
         mean, lower, upper, noise = self._edges(mean, q)
         variance = jnp.asarray(variance, mean.dtype)
@@ -116,8 +116,11 @@ class OrdinalProbit(eqx.Module):
     def _edges(
         self, f: ArrayLike, q: ArrayLike
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """`f`, the two edges of category `q` (infinite at the ends) and the noise, in the dtype of `f`; NaN where there
-        is no such likelihood, and for a category below 0. Raises `InputError` for what are no scalars."""
+        """`f`, the lower and upper edge of category `q` (infinite at the ends) and the noise, in the dtype of `f`.
+
+        NaN for invalid thresholds or noise, and for a negative category. Raises `InputError` for arguments that are not
+        scalars.
+        """
         if jnp.ndim(f) or jnp.ndim(q) or jnp.ndim(self.noise) or jnp.ndim(self.thresholds) != 1:
             shapes = f"{jnp.shape(f)}, {jnp.shape(q)}, {jnp.shape(self.thresholds)} and {jnp.shape(self.noise)}"
             raise InputError(
@@ -135,7 +138,7 @@ class OrdinalProbit(eqx.Module):
 
 
 class OrdinalTerms(eqx.Module):
-    """The answers as log-likelihood terms with slopes and curvatures, 0 where there is no answer."""
+    """Responses as log-likelihood terms with slopes and curvatures; 0 in rows without a response."""
 
     likelihood: OrdinalProbit
     q: Int[Array, " n"]
@@ -149,7 +152,7 @@ class OrdinalTerms(eqx.Module):
 
 
 class TiltedTerms(eqx.Module):
-    """The same answers averaged over cavities, for expectation propagation."""
+    """Responses averaged over cavities, for expectation propagation: log integrals, slopes and site precisions."""
 
     likelihood: OrdinalProbit
     q: Int[Array, " n"]

@@ -1,6 +1,7 @@
-"""Newton's method for the mode of a log-concave posterior, as two root finders of optimistix: full steps on the
-weights, and damped steps in whitened coordinates. Apart from `hilbo.laplace`, which has the model and imports this
-where a fit is traced: optimistix is slow to import.
+"""Newton's method for the mode of a log-concave posterior, as two root finders of optimistix.
+
+Full steps on the weights, and damped steps in whitened coordinates. A module of its own because optimistix is slow to
+import: `hilbo.laplace` imports it only when a fit is traced.
 """
 
 from collections.abc import Callable
@@ -22,7 +23,7 @@ Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " 
 
 
 class _FullState(eqx.Module):
-    """What is known at the weights that were evaluated last."""
+    """State at the weights evaluated last."""
 
     eta: Float[Array, " n"]  # K a
     objective: Float[Array, ""]
@@ -31,8 +32,9 @@ class _FullState(eqx.Module):
 
 
 class FullNewton(optx.AbstractRootFinder):
-    """Full steps on the weights a, eta = K a, as long as the log posterior rises (R & W, algorithm 3.1). `args` are the
-    terms and K. One evaluation an iteration, the first of them at the start.
+    """Full Newton steps on the weights a, eta = K a, as long as the log posterior rises (R & W, algorithm 3.1).
+
+    `args` are the terms and K. One evaluation per iteration, the first of them at the start.
     """
 
     rtol: float = 0.0
@@ -53,9 +55,9 @@ class FullNewton(optx.AbstractRootFinder):
         target = curvature * eta + slope
         half = solve_lower(lower, (root * (covariance @ target))[:, None])
         following = target - root * solve_lower_transposed(lower, half)[:, 0]
-        off = slope - y
+        mismatch = slope - y
         # |off| |K off| >= off' K off, and unlike it cannot be rounded to less than 0.
-        residual = jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(covariance @ off))
+        residual = jnp.sqrt(jnp.linalg.norm(mismatch) * jnp.linalg.norm(covariance @ mismatch))
         objective = jnp.sum(values) - 0.5 * y @ eta
         slack = 4.0 * jnp.finfo(y.dtype).eps * (jnp.sum(jnp.abs(values)) + jnp.abs(y @ eta))
         return following, _FullState(eta, objective, residual, objective >= state.objective - slack), None
@@ -70,12 +72,12 @@ class FullNewton(optx.AbstractRootFinder):
 
     @staticmethod
     def tolerance(dtype: DTypeLike) -> Float[Array, ""]:
-        """Of the residual, in standard deviations of the prior."""
+        """Tolerance of the residual, in standard deviations of the prior."""
         return jnp.asarray(jnp.finfo(dtype).eps ** (2 / 3), dtype)
 
 
 class _NewtonState(eqx.Module):
-    """The best point so far, and the step from it that is evaluated next."""
+    """Best point so far, and the step to be evaluated next."""
 
     v: Float[Array, " n"]  # the mode in whitened coordinates, eta = R v
     direction: Float[Array, " n"]
@@ -87,8 +89,10 @@ class _NewtonState(eqx.Module):
 
 
 class DampedNewton(optx.AbstractRootFinder):
-    """One evaluation an iteration, at `v + scale * direction`: taken if the log posterior rose by a share of what the
-    slope promised (beyond its own rounding), else the scale is halved. `options` hold the root R and the start v.
+    """Newton steps damped by Armijo's rule in whitened coordinates; one evaluation per iteration.
+
+    The point `v + scale * direction` is accepted if the log posterior rose by a fraction of the increase predicted by
+    the slope (beyond its own rounding), else the scale is halved. `options` hold the root R and the start v.
     """
 
     rtol: float = 0.0
@@ -107,7 +111,7 @@ class DampedNewton(optx.AbstractRootFinder):
         trial = state.v + state.scale * state.direction
         taken, slack = _newton_state(args[0], root, trial)
         risen = taken.objective >= state.objective + 1e-4 * state.scale * state.gain - slack
-        # A start without a finite objective has no direction in which to look for one: that ends the search.
+        # A start without a finite objective ends the search.
         halved = jnp.where(jnp.isfinite(state.objective), 0.5 * state.scale, 0.0)
         refused = eqx.tree_at(lambda s: s.scale, state, halved)
         state = jax.tree.map(lambda new, old: jnp.where(risen, new, old), taken, refused)
@@ -125,7 +129,10 @@ class DampedNewton(optx.AbstractRootFinder):
 def _newton_state(
     terms: Terms, root: Float[Array, "n n"], v: Float[Array, " n"]
 ) -> tuple[_NewtonState, Float[Array, ""]]:
-    """Everything at `v`: objective, residual and what it can resolve, next direction; and the objective's rounding."""
+    """State at `v`: objective, residual with its tolerance, and next direction.
+
+    Also the rounding error of the objective.
+    """
     values, slope, curvature = terms(root @ v)
     uphill = root.T @ slope - v
     newton_matrix = jnp.eye(v.shape[0], dtype=v.dtype) + (root.T * curvature[None, :]) @ root
@@ -143,5 +150,5 @@ def _newton_state(
         residual=jnp.linalg.norm(uphill),
         tolerance=jnp.clip(4.0 * epsilon * jnp.linalg.norm(summed), epsilon ** (2 / 3), epsilon**0.25),
     )
-    # The values are rounded, and so is R v, to which they answer by their slopes: at little noise that is far more.
+    # Rounding of the values, and of R v times the slopes, which dominates at little noise.
     return state, 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + 0.5 * v @ v + jnp.abs(slope) @ (magnitude @ jnp.abs(v)))

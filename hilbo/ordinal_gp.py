@@ -1,4 +1,4 @@
-"""Gaussian process with an ordinal likelihood: the model of one participant, and its posterior given the answers.
+"""Gaussian process with an ordinal likelihood: the model of one participant, and its posterior given the responses.
 
     gp        = OrdinalGP(kernel=RBF(theta=30.0, variance=1.0), likelihood=OrdinalProbit((-0.5, 0.5), noise=0.5))
     trials    = Trials.from_arrays(x, q)
@@ -51,14 +51,14 @@ _CACHED, _PARTS = 2**16, 8  # covariances held at a time when many points are pr
 
 
 class InferenceError(RuntimeError):
-    """A fit whose certificate does not hold; the message says which figure failed and what may be done."""
+    """A fit did not converge; the message states which diagnostic failed and possible remedies."""
 
 
 class OrdinalGP(eqx.Module):
-    """Zero-mean Gaussian process prior on the latent realism f and an ordinal likelihood of the answers."""
+    """Zero-mean Gaussian process prior on the latent function f and an ordinal likelihood of the responses."""
 
     kernel: Any
-    """A `Kernel`: one of `hilbo.kernels`, or one of yours; maximum evidence and sessions take the RBF alone."""
+    """A `Kernel`: one of `hilbo.kernels` or a custom one; maximum evidence and sessions support the RBF only."""
     likelihood: OrdinalProbit
 
     def __check_init__(self) -> None:
@@ -70,7 +70,7 @@ class OrdinalGP(eqx.Module):
 
 
 class Posterior(eqx.Module):
-    """Posterior of the latent realism of one participant; the result of [`fit`][]."""
+    """Posterior of the latent function of one participant; the result of [`fit`][]."""
 
     gp: OrdinalGP
     trials: Trials
@@ -78,16 +78,16 @@ class Posterior(eqx.Module):
 
     @property
     def log_evidence(self) -> Float[Array, ""]:
-        """log p(answers) under the approximation. A scalar, in nats."""
+        """Approximate log p(responses). A scalar, in nats."""
         return self.latent.log_evidence
 
     @property
     def certificate(self) -> Certificate | SamplingCertificate:
-        """Residual, iterations, jitter, condition and smallest variance of this fit; standard errors if sampled."""
+        """Convergence diagnostics of this fit; standard errors if it is sampled."""
         return self.latent.certificate
 
     def mean(self, x: _PointsLike) -> Float[Array, " m"]:
-        """Posterior mean (m,) of f at points (m, d) of the unit cube: the variance is not computed."""
+        """Posterior mean (m,) of f at points (m, d) of the unit cube, without computing the variance."""
         return _mean(self, self._points(x))
 
     def predict(self, x: _PointsLike) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
@@ -95,22 +95,25 @@ class Posterior(eqx.Module):
         return _predict(self, self._points(x))
 
     def predict_explained(self, x: _PointsLike) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Posterior mean, and the part of the prior variance that the answers explain, to all its digits.
+        """Posterior mean, and the part of the prior variance that the responses explain, without cancellation.
 
         `x` (m, d) in the unit cube -> (m,), (m,).
         """
         return _mean_and_explained(self, self._points(x))
 
     def astype(self, dtype: DTypeLike) -> "Posterior":
-        """The same posterior in another float dtype. Screening many points in float32 costs half as much, and errs by
-        about 1e-6 of the prior's standard deviation."""
+        """Posterior converted to another float dtype.
+
+        Screening many points in float32 costs half as much, with an error of about 1e-6 of the prior's standard
+        deviation.
+        """
         return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, self)
 
     def class_probabilities(self, x: _PointsLike) -> Float[Array, "m categories"]:
-        """Probabilities (m, C) of the answers to be expected at points (m, d) of the unit cube.
+        """Predicted probabilities (m, C) of the response categories at points (m, d) of the unit cube.
 
-        From mean and variance, f being taken for normal; after `inference="exact"` from the samples themselves.
-        Raises `InputError` for points of another shape.
+        From mean and variance, assuming a normal f; after `inference="exact"` from the samples themselves. Raises
+        `InputError` for points of another shape.
         """
         if isinstance(self.latent, ExactPosterior):
             return _sampled_probabilities(self, self._points(x))[0]
@@ -120,7 +123,7 @@ class Posterior(eqx.Module):
     def standard_errors(
         self, x: _PointsLike
     ) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, "m categories"]]:
-        """Of mean (m,), variance (m,) and class probabilities (m, C): of an exact posterior, which is sampled.
+        """Monte Carlo standard errors of mean (m,), variance (m,) and class probabilities (m, C) of an exact posterior.
 
         Raises `InputError` for a posterior of another inference, and for points of another shape than (m, d).
         """
@@ -136,7 +139,7 @@ class Posterior(eqx.Module):
         return _draw(self, key, self._points(x), count)
 
     def _points(self, x: _PointsLike) -> Float[Array, "m d"]:
-        """Points as an array. Raises `InputError` for another shape than (m, d)."""
+        """Points as an array. Raises `InputError` for another shape than (m, d), and for values that are not finite."""
         dtype = self.trials.x.dtype
         points = floats(x, dtype) if isinstance(x, jax.Array) else numbers("Posterior", "x", x, dtype)
         if self.trials.x.ndim != 2:
@@ -167,12 +170,13 @@ class Posterior(eqx.Module):
 
 @functools.partial(jax.jit, static_argnames="count")
 def _draw(posterior: Posterior, key: PRNGKeyArray, x: Float[Array, "m d"], count: int) -> Float[Array, "{count} m"]:
+    """Draw from an exact posterior."""
     kernel, latent = posterior.gp.kernel, _sampled(posterior, "draw")
     return latent.draw(key, gram(kernel, posterior.trials.x, x), gram(kernel, x, x), count)
 
 
 def _sampled(posterior: Posterior, wanted: str) -> ExactPosterior:
-    """The latent posterior, if it is sampled; `wanted` is the method that asks."""
+    """Latent posterior if it is sampled, else raise `InputError`; `wanted` is the calling method."""
     if not isinstance(posterior.latent, ExactPosterior):
         raise InputError(f'Posterior.{wanted}: this posterior is not sampled; fit with inference="exact".')
     return posterior.latent
@@ -195,20 +199,23 @@ def _sampled_probabilities(
 
 @jax.jit
 def _mean(posterior: Posterior, x: Float[Array, "m d"]) -> Float[Array, " m"]:
+    """Posterior mean (m,)."""
     return gram(posterior.gp.kernel, x, posterior.trials.x) @ posterior.latent.weights
 
 
 @jax.jit
 def _predict(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Posterior mean and variance, (m,) each."""
     mean, explained = _mean_and_explained(posterior, x)
     return mean, jax.vmap(posterior.gp.kernel.diagonal)(x) - explained
 
 
 @jax.jit
 def _mean_and_explained(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Posterior mean and explained variance, (m,) each, computed in parts."""
     latent, count = posterior.latent, x.shape[0]
-    # Many points go in parts whose covariances stay in a core's cache; no scan, which would drop derivative rules. Each
-    # coordinate lies in one piece, for loops over points that take several at a time.
+    # Parts keep the covariances in a core's cache; a scan would drop derivative rules. The transposition makes each
+    # coordinate contiguous, for vectorised loops over points.
     x = jax.lax.optimization_barrier(x.T).T
     size = max(_CACHED // max(posterior.trials.capacity, 1), -(-count // _PARTS), 1)
     parts = [
@@ -231,21 +238,21 @@ def fit(
     start: Float[Array, " n"] | None = None,
     throw: bool = True,
 ) -> Posterior:
-    """Posterior of the latent function given the answers.
+    """Posterior of the latent function given the responses.
 
     **Arguments:**
 
     - `gp`: the model.
-    - `trials`: the answers; none gives the prior.
-    - `inference`: "laplace" (paper, section IV-1), or "ep", expectation propagation: the same kind of posterior with
-      a far smaller error; or "ep_corrected", which is ten times nearer still and costs a little more; or "exact",
-      sampled, for up to about 100 answers and without derivatives (docs/methods/inference.md). The samples are the
-      same ones in every fit.
+    - `trials`: the responses; empty trials give the prior.
+    - `inference`: "laplace" (paper, section IV-1); "ep", expectation propagation, with a far smaller error;
+      "ep_corrected", ten times more accurate still at slightly more cost; or "exact", sampled, for up to about 100
+      responses and without derivatives (docs/methods/inference.md). The samples are the same in every fit.
     - `start`: `posterior.latent.weights` of a fit to nearly the same trials, to save Newton steps.
-    - `throw`: raise `InferenceError` if the certificate does not hold. Use `False` under `vmap`, and read
+    - `throw`: raise `InferenceError` if the fit has not converged. Use `False` under `vmap`, and check
       `posterior.certificate.converged`.
 
-    **Returns:** a [`Posterior`][], differentiable in every array of `gp`.
+    **Returns:** a [`Posterior`][], differentiable in every array of `gp`. Raises `InputError` for arguments that do not
+    match.
     """
     if not isinstance(gp, OrdinalGP) or not isinstance(trials, Trials):
         given = f"{type(gp).__name__} and {type(trials).__name__}"
@@ -254,22 +261,23 @@ def fit(
         raise InputError(f'fit: inference is "{inference}"; it must be one of {", ".join(_SOUGHT)}.')
     check_shapes(gp.kernel, gp.likelihood, trials, start)
     if inference == "exact" and concrete(trials):  # whose samples would take -1 for the last category
-        check_answers(_answers_alone(trials), gp.likelihood.categories)
+        check_answers(_without_padding(trials), gp.likelihood.categories)
     if concrete(trials):
         remark_outside("fit", gp.kernel, np.asarray(trials.x)[np.asarray(trials.mask)])
     posterior = _fit(gp, trials, start, inference)
     return _checked(posterior, _SOUGHT[inference]) if throw else posterior
 
 
-def _answers_alone(trials: Trials) -> Trials:
-    """The trials with nothing in the rows that hold no answer: 0 times NaN is NaN, in values and in derivatives."""
+def _without_padding(trials: Trials) -> Trials:
+    """Trials with rows without a response set to 0, since 0 times NaN is NaN, in values and in derivatives."""
     x = jnp.where(trials.mask[:, None], trials.x, 0)
     return Trials(x, jnp.where(trials.mask, trials.q, 0), trials.mask, trials.context)
 
 
 @functools.partial(jax.jit, static_argnames="inference")
 def _fit(gp: OrdinalGP, trials: Trials, start: Float[Array, " n"] | None, inference: str) -> Posterior:
-    trials = _answers_alone(trials)
+    """Compiled part of `fit`."""
+    trials = _without_padding(trials)
     covariance = gram(gp.kernel, trials.x, trials.x)
     if inference in ("ep", "ep_corrected"):
         tilted = TiltedTerms(gp.likelihood, trials.q, trials.mask)
@@ -281,7 +289,7 @@ def _fit(gp: OrdinalGP, trials: Trials, start: Float[Array, " n"] | None, infere
 
 
 def _exact_latent(likelihood: OrdinalProbit, trials: Trials, covariance: Float[Array, "n n"]) -> ExactPosterior:
-    """By sampling; the samples are the same ones in every fit."""
+    """Exact posterior by sampling, with the same samples in every fit."""
     ends = jnp.full((1,), jnp.inf, covariance.dtype)
     edges = jnp.concatenate([-ends, likelihood.thresholds.astype(covariance.dtype), ends])
     noise = likelihood.noise.astype(covariance.dtype)
@@ -289,6 +297,7 @@ def _exact_latent(likelihood: OrdinalProbit, trials: Trials, covariance: Float[A
 
 
 def _checked(posterior: Posterior, sought: str) -> Posterior:
+    """Return the posterior; raise `InferenceError` (under `jit` an equinox error) if it has not converged."""
     certificate = posterior.certificate
     if isinstance(certificate.converged, jax.core.Tracer):
         message = f"the {sought} was not found to its tolerance; fit with throw=False and read the certificate"

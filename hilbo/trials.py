@@ -1,6 +1,6 @@
-"""The answers of one participant as arrays: asked points and categories, padded to a capacity and masked.
+"""Responses of one participant as arrays: tested points and categories, padded to a capacity and masked.
 
-With a fixed capacity a session that grows from 0 to 25 answers compiles once.
+With a fixed capacity a session that grows from 0 to 25 responses compiles once.
 """
 
 from collections.abc import Sequence
@@ -27,22 +27,22 @@ _BLOCK = 32  # default capacities are multiples of this, so that growing data ra
 
 
 def _floats(x: Any) -> Any:
-    """Points as floating-point numbers; trees of something else, such as filters, as they are."""
+    """Points as floating-point numbers; other pytree leaves unchanged."""
     return floats(x) if isinstance(x, jax.Array | np.ndarray) else x
 
 
 class Trials(eqx.Module):
-    """Answers of one participant, padded to a fixed capacity.
+    """Responses of one participant, padded to a fixed capacity.
 
-    `x` (capacity, d) are the asked points in the unit cube, `q` (capacity,) the categories 0..C-1, `mask` says which
-    rows hold an answer. Rows without an answer have no influence whatever they contain.
+    `x` (capacity, d) are the tested points in the unit cube, `q` (capacity,) the categories 0..C-1, `mask` marks the
+    rows with a response. Rows without a response have no influence.
     """
 
     x: Float[Array, "n d"] = eqx.field(converter=_floats)
     q: Int[Array, " n"]
     mask: Bool[Array, " n"]
     context: Int[Array, " n"] | None = None
-    """What else was the case at each answer, such as the clip, as a number from 0: the level of a random effect."""
+    """Condition of each response, such as the clip, as an index from 0: the level of a random effect."""
 
     @classmethod
     def from_arrays(cls, x: ArrayLike, q: ArrayLike, capacity: int | None = None) -> "Trials":
@@ -77,19 +77,21 @@ class Trials(eqx.Module):
 
     @classmethod
     def empty(cls, capacity: int, dim: int) -> "Trials":
-        """No answers yet, room for `capacity` of them."""
+        """Trials without responses, with room for `capacity` of them."""
         return cls.from_arrays(np.zeros((0, dim)), np.zeros(0, int), capacity)
 
     @property
     def capacity(self) -> int:
-        """How many answers there is room for."""
+        """Number of rows."""
         return self.x.shape[-2]
 
     def append(self, x: ArrayLike | Sequence[float], q: ArrayLike) -> "Trials":
-        """With one more answer in the first free row: the shapes stay, nothing recompiles. Contexts are not kept.
+        """Trials with one more response in the first free row; shapes stay the same, so nothing recompiles.
+
+        Contexts are dropped.
 
         `x` (d,) in the unit cube, `q` a category in 0..C-1. Raises `InputError` for a point of another shape, values
-        that are not finite, what is no category, answers of several people, and a table that is full; where these are
+        that are not finite, an invalid category, trials of several participants, and a full table; where these are
         traced, x becomes NaN.
         """
         if self.mask.ndim != 1:
@@ -111,13 +113,13 @@ class Trials(eqx.Module):
         )
 
     def first(self, count: ArrayLike) -> "Trials":
-        """Only the first `count` rows, with the same capacity. `count`: an int, from 0 to the capacity."""
+        """Trials with only the first `count` rows, at the same capacity. `count`: an int, from 0 to the capacity."""
         keep = jnp.arange(self.capacity) < count
         return Trials(self.x, self.q, self.mask & keep, self.context)
 
 
 def _array(name: str, value: Any) -> np.ndarray:
-    """As NumPy has it. Raises `InputError` for rows of different lengths."""
+    """Value as a NumPy array. Raises `InputError` for rows of different lengths."""
     try:
         return np.asarray(value)
     except ValueError:
@@ -126,7 +128,7 @@ def _array(name: str, value: Any) -> np.ndarray:
 
 
 def _check_points(points: np.ndarray) -> None:
-    """Refuse what is no number, numbers that no fit computes with, and points without a coordinate."""
+    """Raise `InputError` for points that are not float32, float64 or integers, and for points without coordinates."""
     kind, size = points.dtype.kind, points.dtype.itemsize
     if kind not in "biu" and (kind, size) not in {("f", 4), ("f", 8)}:
         raise InputError(f"Trials: x is of type {points.dtype}; give numbers, as float32 or float64.")
@@ -135,6 +137,7 @@ def _check_points(points: np.ndarray) -> None:
 
 
 def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:
+    """Raise `InputError` for shapes that do not match, values that are not finite, and invalid categories."""
     if points.ndim != 2 or answers.ndim != 1 or len(points) != len(answers):
         raise InputError(
             f"Trials: x has shape {points.shape} and q has shape {answers.shape}; give x as (n, d) and q as (n,)."
@@ -147,6 +150,6 @@ def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:
 
 
 def _check_categories(answers: np.ndarray) -> None:
-    """Refuse what is no category; a number beyond 32 bits would become a small one, which is a category."""
+    """Raise `InputError` for categories that are not integers from 0 to the largest 32-bit integer."""
     if not np.issubdtype(answers.dtype, np.integer) or answers.min() < 0 or answers.max() > np.iinfo(np.int32).max:
         raise InputError("Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).")
