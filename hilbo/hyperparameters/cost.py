@@ -146,7 +146,7 @@ def _parts(
     Float[Array, " l"],
     Float[Array, " k"],
 ]:
-    """K as a function of the kernel's coordinates, the terms as one of the likelihood's, and both coordinate vectors."""
+    """K as a function of the kernel's coordinates, terms as one of the likelihood's, and both coordinate vectors."""
     of_likelihood = {name: value for name, value in coordinates.items() if name in OF_THE_LIKELIHOOD}
     of_kernel = {name: value for name, value in coordinates.items() if name not in OF_THE_LIKELIHOOD}
     flat_likelihood, restore_likelihood = ravel_pytree(of_likelihood)
