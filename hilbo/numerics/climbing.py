@@ -1,4 +1,4 @@
-"""Maxima of a function over a feasible set of the unit cube, by Newton's method from several starts."""
+"""Maximisation of a function over a feasible set of the unit cube, by Newton's method from several starts."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,14 +19,14 @@ _RESOLUTION = 1e-6  # and the trust radius at a kink of the passive set's wall: 
 
 
 class Choice(eqx.Module):
-    """The chosen point and how it was found."""
+    """Maximum of a search and how it was found."""
 
     x: Float[Array, " d"]
     """In the unit cube."""
     value: Float[Array, ""]
     """Its score."""
     candidate: Int[Array, ""]
-    """Index of the best candidate, from which or near which it was polished."""
+    """Index of the candidate with the highest score."""
     candidate_value: Float[Array, ""]
     """That candidate's score; `value` is never below it."""
 
@@ -46,19 +46,19 @@ def climb(
     steps: int = 50,
     gain: ArrayLike = 0.0,
 ) -> Choice:
-    """The best of the usable starts and of where Newton's method leads from them.
+    """Maximise `score` from several starts by Newton's method; return the best point found.
 
     **Arguments:**
 
     - `starts` (s, d) points of the unit cube, `usable` (s,); the result's `candidate` is a row of these.
     - `score`: of one point, differentiable.
     - `from_box`, `to_box`: between the optimiser's cube, in which everything is feasible, and the unit cube.
-    - `feasible`: whether a polished point may be rendered (starts are known to).
-    - `allowed`: which points may be chosen at all, e.g. none too near to earlier ones.
-    - `walls`: linear ones within the optimiser's cube, if not everything in it is feasible; `held`: coordinates that
-      have steps, and `neighbours`: the points a step away from one, which are tried where polishing ends.
-    - `steps`: at most so many Newton steps from each start.
-    - `gain`: polishing ends where the score could rise by less than that within the cube (`TrustRegionNewton`).
+    - `feasible`: whether a point may be rendered (starts are known to be feasible).
+    - `allowed`: which points may be chosen, e.g. none too close to earlier ones.
+    - `walls`: linear constraints in the optimiser's cube, if not everything in it is feasible; `held`: discrete
+      coordinates, and `neighbours`: the points one step away, which are tried at the end of each search.
+    - `steps`: largest number of Newton steps from each start.
+    - `gain`: a search ends where the score could rise by less than this within the cube (`TrustRegionNewton`).
     """
 
     def may_end(x):
@@ -71,13 +71,13 @@ def climb(
 
 
 class _Straight(NamedTuple):
-    """A search through the unit cube itself.
+    """Search in the unit cube itself, without walls.
 
-    Only where that ends outside the feasible set, on a hill higher than what was seen before, does another follow in
-    the optimiser's coordinates, from the wall beside that end or from the start, whichever is better: there walls are
-    flat, but the function inside is bent wherever the wall is.
-    One start after the other: each stops when it is done, where a batch would wait for its slowest, or on the way to
-    where an earlier one ended: once a hill stands out, most good starts are on its slopes.
+    If it ends outside the feasible set, at a higher score than found so far, a second search follows in the optimiser's
+    coordinates, from the projection of that end onto the boundary or from the start, whichever is better: there the
+    boundary is flat, but the function is distorted where the boundary is curved. Starts are processed one after the
+    other: each search stops when it has converged, or when it approaches the end of an earlier one, since good starts
+    often share a mode.
     """
 
     score: Callable[[Float[Array, " d"]], Float[Array, ""]]
@@ -88,13 +88,17 @@ class _Straight(NamedTuple):
     gain: ArrayLike
 
     def best(self, starts: Float[Array, "s d"], usable: Bool[Array, " s"]) -> Choice:
+        """Best end of the searches from all usable starts."""
         no_ends = jnp.full((), -jnp.inf, starts.dtype), jnp.full_like(starts, jnp.nan)
         _, (ends, values, start_values) = jax.lax.scan(self._next, no_ends, (starts, usable, jnp.arange(len(starts))))
         return _best_of(ends, values, start_values)
 
     def _next(self, state, start):
-        """`state`: the highest score so far, and where the searches ended; `start`: a point, whether it is usable, and
-        its row. The next state, and where the search from there ends, the score there, and that of the start."""
+        """Search from one start.
+
+        `state`: highest score so far, and the ends of the searches; `start`: a point, whether it is usable, and its
+        row. Returns the next state, and the end, its score, and the score of the start.
+        """
         (highest, earlier_ends), (x, may, row) = state, start
         start_value = jnp.where(may, self.score(x), -jnp.inf)
         if self.steps == 0:
@@ -110,7 +114,7 @@ class _Straight(NamedTuple):
         return (jnp.maximum(highest, value), earlier_ends.at[row].set(straight)), (end, value, start_value)
 
     def _along_the_wall(self, x, outside):
-        """In the optimiser's coordinates, after a search from x ended `outside`."""
+        """Search in the optimiser's coordinates, after a search from x ended `outside` the feasible set."""
         aside = self.from_box(jnp.clip(self.to_box(outside), 0.0, 1.0))
         start = jnp.where(self.score(aside) > self.score(x), aside, x)
         w, value = _polish(lambda w: self.score(self.from_box(w)), self.to_box(start), self.steps, self.gain, {})
@@ -119,7 +123,7 @@ class _Straight(NamedTuple):
 
 
 class _Within(NamedTuple):
-    """A search between walls, and over steps, in the optimiser's coordinates alone."""
+    """Search with walls or discrete coordinates, in the optimiser's coordinates."""
 
     score: Callable[[Float[Array, " d"]], Float[Array, ""]]
     from_box: Callable[[Float[Array, " d"]], Float[Array, " d"]]
@@ -132,7 +136,7 @@ class _Within(NamedTuple):
     def climbed(
         self, start: Float[Array, " d"], usable: Bool[Array, ""], steps: int, gain: ArrayLike
     ) -> tuple[Float[Array, " d"], Float[Array, ""], Float[Array, ""]]:
-        """Where the search from a start ends, the score there, and that of the start."""
+        """Search from a start; return the end, its score, and the score of the start."""
         start_value = jnp.where(usable, self.score(start), -jnp.inf)
         if steps == 0:
             return start, start_value, start_value
@@ -154,7 +158,7 @@ class _Within(NamedTuple):
         return end, value, start_value
 
     def _polished(self, x, value, steps, gain):
-        """The end of Newton's method from x; x itself if that is no higher, or may not be rendered."""
+        """End of Newton's method from x; x itself if that is not higher or not allowed."""
         options = {"walls": self.walls, "held": self.held}
         w, height = _polish(lambda w: self.score(self.from_box(w)), self.to_box(x), steps, gain, options)
         end = jnp.where(self.held, x, self.from_box(jnp.clip(w, 0.0, 1.0)))  # a step may end a rounding error outside
@@ -162,7 +166,7 @@ class _Within(NamedTuple):
         return jnp.where(better, end, x), jnp.where(better, height, value)
 
     def _around(self, x):
-        """The points a step away, brought between the walls; and their scores, -inf where they may not be."""
+        """Points one step away, projected between the walls, and their scores; -inf if not allowed."""
         assert self.neighbours is not None
         near = self.neighbours(x)
         if self.walls.normals.shape[0]:
@@ -171,7 +175,7 @@ class _Within(NamedTuple):
         return near, jnp.where(may, jax.vmap(self.score)(near), -jnp.inf)
 
     def _between(self, x):
-        """The nearest point between the walls with the same steps."""
+        """Nearest point between the walls with the same discrete coordinates."""
         w = self.to_box(x)
         cube = walls_of_cube(self.walls, self.held, w)
         left = self.walls.offsets.astype(w.dtype) - self.walls.normals.astype(w.dtype) @ w
@@ -181,6 +185,7 @@ class _Within(NamedTuple):
 
 
 def _best_of(ends: Float[Array, "s d"], values: Float[Array, " s"], start_values: Float[Array, " s"]) -> Choice:
+    """Best of the ends, with the best start."""
     best, best_start = jnp.argmax(values), jnp.argmax(start_values)
     return Choice(ends[best], values[best], best_start, start_values[best_start])
 
@@ -188,7 +193,7 @@ def _best_of(ends: Float[Array, "s d"], values: Float[Array, " s"], start_values
 def spread(
     values: Float[Array, " m"], candidates: Float[Array, "m d"], count: int, apart: float = 0.1
 ) -> Int[Array, " count"]:
-    """Rows of good candidates from different places: the best, the best further than `apart` from it, and so on.
+    """Rows of high values at distinct locations: the maximum, the maximum further than `apart` from it, and so on.
 
     `values` (m,), `candidates` (m, d) -> (count,) row numbers.
     """
@@ -208,7 +213,7 @@ def _polish(
     gain: Any,
     options: dict[str, Any],
 ) -> tuple[Float[Array, " d"], Float[Array, ""]]:
-    """Newton's method within the unit cube, or between the walls of `options`: where it ends, and the score there."""
+    """Newton's method within the unit cube, or between the walls of `options`; returns the end and its score."""
     import optimistix as optx  # slow to import, and needed only where a search is traced
 
     from hilbo.numerics.newton import TrustRegionNewton

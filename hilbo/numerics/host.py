@@ -14,8 +14,10 @@ __all__ = ["floating", "namespace_of", "on_host", "scan", "to_device"]
 
 
 def namespace_of(*values: Any) -> Any:
-    """`numpy` where all values are NumPy arrays or plain numbers, else `jax.numpy`, which is imported only then: for
-    functions that are written once and return the kind of array that they were given."""
+    """`numpy` if all values are NumPy arrays or plain numbers, else `jax.numpy`, which is imported only then.
+
+    For functions that return the kind of array that they were given.
+    """
     if all(isinstance(value, np.ndarray | np.generic | float | int) for value in values):
         return np
     import jax.numpy as jnp
@@ -38,8 +40,10 @@ def scan(step: Callable[[Any, Any], Any], start: Any, over: Any) -> Any:
 
 
 def to_device(value: Any, dtype: Any = None) -> Any:
-    """A JAX array of a value: as `jnp.asarray`, without compiling anything where the value is NumPy's or Python's. The
-    copy does not change with the original."""
+    """Convert a value to a JAX array, without compiling anything if it is NumPy's or Python's.
+
+    The copy is independent of the original.
+    """
     import jax
 
     if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
@@ -48,6 +52,6 @@ def to_device(value: Any, dtype: Any = None) -> Any:
 
 
 def floating(x: Any) -> Any:
-    """The values as floating-point numbers of the default type; NumPy arrays stay NumPy arrays."""
+    """Convert values to floating-point numbers of the default type; NumPy arrays stay NumPy arrays."""
     xp = namespace_of(x)
     return xp.asarray(x, xp.result_type(1.0, x))

@@ -28,7 +28,7 @@ _STALLED = 1e10  # a damping with which no step changes anything
 
 
 class Solution(eqx.Module):
-    """A minimum in the box: its place, |r|², JᵀJ and Jᵀr there, and whether the search came to an end."""
+    """Result of `least_squares`: point q, |r|², JᵀJ and Jᵀr there, number of iterations, and whether it converged."""
 
     q: Float[Array, " p"]
     cost: Float[Array, ""]
@@ -93,7 +93,7 @@ def least_squares(
 
 
 def _judged(state: _State, q: Float[Array, " p"], trial: _Evaluation, tiny: ArrayLike, least: ArrayLike) -> _State:
-    """The step to q taken or not; `trial`: what was evaluated at q."""
+    """Next state: the step to q accepted or rejected; `trial`: evaluation at q."""
     cost, gradient, normal = trial
     moved = q - state.q
     better = cost < state.cost
@@ -111,7 +111,7 @@ def _judged(state: _State, q: Float[Array, " p"], trial: _Evaluation, tiny: Arra
 
 
 def _direction(state: _State, lower: Float[Array, " p"], upper: Float[Array, " p"]) -> Float[Array, " p"]:
-    """The damped step of the free parameters; the others have 0."""
+    """Damped step of the free parameters; 0 for the others."""
     held = ((state.q <= lower) & (state.gradient >= 0)) | ((state.q >= upper) & (state.gradient <= 0))
     free = ~held & (lower < upper)
     size = jnp.diag(state.normal)
@@ -124,6 +124,6 @@ def _direction(state: _State, lower: Float[Array, " p"], upper: Float[Array, " p
 
 
 def solve_symmetric(matrix: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:
-    """Solution of a positive definite system; may be mapped (see `linalg`)."""
+    """Solve a positive definite system; may be mapped by `vmap` (see `linalg`)."""
     factor = linalg.cholesky(matrix)
     return linalg.solve_lower_transposed(factor, linalg.solve_lower(factor, right[:, None]))[:, 0]

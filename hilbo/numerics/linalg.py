@@ -1,10 +1,9 @@
-"""Dense factorisations that may be mapped over people: one at a time on a CPU, batched elsewhere.
+"""Dense factorisations that can be mapped by `vmap`: one matrix at a time on a CPU, batched elsewhere.
 
-jaxlib's batched LAPACK kernels wait for the thread pool from inside that pool. Where a program has two of them ready at
-once, as many fits have, all the workers of a small machine end up waiting for each other, for ever (seen with jaxlib
-0.10 on two cores: every worker in `ParallelBatchMap`). A kernel on one matrix does not wait. Under `jax.vmap` these
-functions therefore loop over the matrices on a CPU, and stay batched on other devices.
-They are not differentiable; their callers have derivative rules of their own.
+jaxlib's batched LAPACK kernels wait for the thread pool from inside that pool. If two of them are ready at once, all
+workers of a small machine can deadlock (seen with jaxlib 0.10 on two cores: every worker in `ParallelBatchMap`). A
+kernel on one matrix does not wait. Under `jax.vmap` these functions therefore loop over the matrices on a CPU, and stay
+batched on other devices. They are not differentiable; their callers have derivative rules of their own.
 """
 
 from collections.abc import Callable
@@ -17,8 +16,10 @@ __all__ = ["cholesky", "eigh", "one_at_a_time", "solve_lower", "solve_lower_tran
 
 
 def one_at_a_time(function: Callable, together: Callable | None = None) -> Callable:
-    """`function` of pytrees of arrays with a rule for `vmap`: a loop on CPUs, elsewhere the batched kernel, or that of
-    `together`, which does the same."""
+    """Decorator for `vmap`: a loop over `function` on CPUs.
+
+    Elsewhere the batched `function`, or the equivalent `together`.
+    """
     mapped = jax.custom_batching.custom_vmap(function)
     batched = jax.vmap(function if together is None else together)
 

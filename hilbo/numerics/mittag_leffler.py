@@ -57,7 +57,7 @@ def mittag_leffler_increment(alpha: Real[ArrayLike, "..."], z: Real[ArrayLike, "
 
 
 def _increment(alpha: Float[Array, ""], z: Float[Array, ""]) -> Float[Array, ""]:
-    """By its power series where z is small, else from E_α itself."""
+    """(1 - E_α(-z))/z, by its power series where z is small, else from E_α."""
     small = z < _SMALL
     large = jnp.where(small, 1, z)
     orders = jnp.arange(1, _TERMS + 1, dtype=z.dtype)
@@ -66,13 +66,13 @@ def _increment(alpha: Float[Array, ""], z: Float[Array, ""]) -> Float[Array, ""]
 
 
 def _safe(a: Float[Array, ""], b: Float[Array, ""], z: Float[Array, ""], nodes: _Nodes) -> Float[Array, ""]:
-    """The value at z = 0 apart, where the logarithm is infinite."""
+    """E_{a,b}(-z), with the value at z = 0 treated separately."""
     at_zero = jnp.where(b == 1, 1, 1 / gamma(b))
     return jnp.where(z > 0, _integral(a, b, jnp.where(z > 0, z, 1), nodes), at_zero)
 
 
 def _integral(a: Float[Array, ""], b: Float[Array, ""], z: Float[Array, ""], nodes: _Nodes) -> Float[Array, ""]:
-    """The integral of the module's text, for z > 0."""
+    """The integral of the module docstring, for z > 0."""
     x, step = (jnp.asarray(value, z.dtype) for value in nodes)
     # The integral does not depend on φ, so its derivative need not know how φ was chosen.
     phi = jax.lax.stop_gradient(jnp.pi / 4 - jnp.minimum(jnp.pi / 2 * (1 - a) / a, jnp.pi / 4))
@@ -90,7 +90,7 @@ def _integral(a: Float[Array, ""], b: Float[Array, ""], z: Float[Array, ""], nod
 def _log_one_plus(
     log_u: Float[Array, " nodes"], psi: Float[Array, ""]
 ) -> tuple[Float[Array, " nodes"], Float[Array, " nodes"]]:
-    """log(1 + u·e^{iψ}) as real part and angle, 0 < ψ < π, for u of any size."""
+    """log(1 + u·e^{iψ}) as real part and angle, for 0 < ψ < π and u of any size."""
     big = log_u > 0
     u = jnp.exp(-jnp.abs(log_u))
     angle = jnp.arctan2(u * jnp.sin(psi), 1 + u * jnp.cos(psi))

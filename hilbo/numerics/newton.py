@@ -1,16 +1,16 @@
-"""Newton's method for a function of a few variables in a box, under a trust radius; an optimistix minimiser.
+"""Newton's method with a trust region for a function of a few variables in a box; an optimistix minimiser.
 
-For functions whose exact Hessian costs little more than their value: the evidence as a function of hyperparameters,
-and the acquisition function at one point. Nothing needs scaling, and the end is exact to rounding.
+For functions whose exact Hessian costs little more than their value: the evidence as a function of hyperparameters, and
+the acquisition function at one point. No scaling is needed, and the result is exact to rounding.
 
-The variables that sit at a bound with the gradient pressing against it are held. Along each eigenvector of the others'
-Hessian the step is -g_i / (|h_i| + |g| / radius): Newton's where the gradient is small, never longer than the radius,
-downhill along negative curvature; and where it would leave the box, it is cut off at the wall. Between linear walls of
-any direction the same: what walls hold is left out, and the step ends at the nearest point between them, in the metric
-of its own stiffness (`hilbo.numerics.polytope`). A step is taken if the
-function falls by a share of what the quadratic model promised, else the radius shrinks and the step turns towards
-steepest descent, so that every start converges. One evaluation an iteration.
-References: Nocedal & Wright (2006), chapter 4; Bertsekas (1982), SIAM J. Control Optim. 20:221 (held variables).
+Variables at a bound with the gradient pointing outwards are fixed. Along each eigenvector of the others' Hessian the
+step is -g_i / (|h_i| + |g| / radius): Newton's where the gradient is small, never longer than the radius, downhill
+along negative curvature; a step that would leave the box is cut off at the bound. Linear walls of any direction are
+treated alike: directions blocked by active walls are removed, and the step ends at the nearest point between the walls,
+in the metric of its own stiffness (`hilbo.numerics.polytope`). A step is accepted if the function decreases by a
+fraction of the decrease predicted by the quadratic model, else the radius shrinks and the step turns towards steepest
+descent, so that it converges from every start. One evaluation per iteration. References: Nocedal & Wright (2006),
+chapter 4; Bertsekas (1982), SIAM J. Control Optim. 20:221 (fixed variables).
 """
 
 from collections.abc import Callable
@@ -29,13 +29,13 @@ from hilbo.numerics.polytope import Polytope, nearest, projector, walls_of_cube
 __all__ = ["Expansion", "TrustRegionNewton", "arrives", "expanded"]
 
 _FIRST_RADIUS = 1.0
-_SAME = 1e-2  # points so near to each other lie below the same minimum: of functions of logarithms, that is
-_TOUCHES = 1e-10  # of a range: so near to a wall, a point is at it
-_ENOUGH, _GOOD = 1e-4, 0.75  # shares of the promised fall: to take a step, and to trust the model further
+_SAME = 1e-2  # distance within which ends count as the same minimum (in logarithmic coordinates)
+_TOUCHES = 1e-10  # distance to a wall, in ranges, within which it is active
+_ENOUGH, _GOOD = 1e-4, 0.75  # fractions of the predicted decrease: to accept a step, and to enlarge the radius
 
 
 class Expansion(NamedTuple):
-    """Value, gradient and Hessian at a point, and what the function returned besides."""
+    """Value, gradient and Hessian at a point, and auxiliary output of the function."""
 
     value: Float[Array, ""]
     gradient: Float[Array, " p"]
@@ -46,7 +46,7 @@ class Expansion(NamedTuple):
 def expanded(
     function: Callable[[Float[Array, " p"]], tuple[Float[Array, ""], PyTree]], at: Float[Array, " p"]
 ) -> Expansion:
-    """The expansion of a function of value and aux by automatic differentiation."""
+    """Expand a function of (value, aux) at a point by automatic differentiation."""
 
     def slope(point):
         value, pull, aux = jax.vjp(function, point, has_aux=True)
@@ -58,7 +58,7 @@ def expanded(
 
 
 class _State(eqx.Module):
-    """The best point so far, and the step from it that is evaluated next."""
+    """Best point so far, and the step from it to be evaluated next."""
 
     here: Expansion
     move: Float[Array, " p"]  # the next step,
@@ -92,7 +92,10 @@ class TrustRegionNewton(optx.AbstractMinimiser):
     gain: float | Float[Array, ""] = 0.0
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """At the start, if its expansion is given; else nowhere yet, and the first step evaluates the start."""
+        """Initial state: at the start if its expansion is given.
+
+        Else empty, so that the first step evaluates the start.
+        """
         del fn, args, f_struct, tags
         flat, _ = ravel_pytree(y)
         if "begun" in options:
@@ -105,7 +108,7 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         return _State(nowhere, jnp.zeros_like(flat), zero, zero + _FIRST_RADIUS, infinite[0], infinite[0])
 
     def step(self, fn, y, args, options, state, tags):
-        """Evaluate the step decided on before, take it or not, and decide on the next."""
+        """Evaluate the planned step, accept or reject it, and plan the next."""
         del tags
         flat, restore = ravel_pytree(y)
         trial = flat + state.move
@@ -124,7 +127,7 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         return restore(flat), _planned(best, flat, radius, options), best.aux
 
     def terminate(self, fn, y, args, options, state, tags):
-        """Stationary within the box, or stuck, or on the way to a known end."""
+        """Whether the search is stationary within the box, stuck, or approaching a known end."""
         del fn, args, tags
         ended = (state.pressing <= self.atol) | (state.ahead < self.gain) | (state.radius < self.resolution)
         earlier_ends = options.get("known")
@@ -133,19 +136,19 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         return ended, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Nothing to add."""
+        """Return the result unchanged."""
         del fn, args, options, state, tags, result
         return y, aux, {}
 
 
 def arrives(y: PyTree, move: Float[Array, " p"], ends: Float[Array, "k p"]) -> Bool[Array, ""]:
-    """Whether this step from `y` goes to one of the known ends."""
+    """Whether the step from `y` leads to one of the known ends."""
     target = ravel_pytree(y)[0] + move
     return jnp.any(jnp.max(jnp.abs(ends - target[None, :]), axis=1) < _SAME)
 
 
 def _bounds(options: dict[str, Any]) -> tuple[Float[Array, " p"] | None, Float[Array, " p"] | None]:
-    """Lower and upper, as vectors."""
+    """Lower and upper bounds as vectors; None if missing."""
     lower, upper = (ravel_pytree(options[side])[0] if side in options else None for side in ("lower", "upper"))
     return lower, upper
 
@@ -153,7 +156,7 @@ def _bounds(options: dict[str, Any]) -> tuple[Float[Array, " p"] | None, Float[A
 def _planned(
     expansion: Expansion, point: Float[Array, " p"], radius: Float[Array, ""], options: dict[str, Any]
 ) -> _State:
-    """The state at `point`, within whatever the options bound it by."""
+    """State at `point` with the next step, within the bounds or walls of the options."""
     if "walls" in options:
         return _plan_between(expansion, point, radius, options["walls"], options["held"])
     return _plan(expansion, point, radius, *_bounds(options))
@@ -162,7 +165,7 @@ def _planned(
 def _plan_between(
     expansion: Expansion, point: Float[Array, " p"], radius: Float[Array, ""], walls: Polytope, held: Bool[Array, " p"]
 ) -> _State:
-    """As `_plan`, between linear walls within the unit cube."""
+    """State at `point` with the next step, between linear walls within the unit cube."""
     seen = walls_of_cube(walls, held, point)
     plain = jnp.eye(point.size, dtype=point.dtype)
     touching = seen.offsets <= _TOUCHES
@@ -192,7 +195,7 @@ def _plan(
     lower: Float[Array, " p"] | None,
     upper: Float[Array, " p"] | None,
 ) -> _State:
-    """The state at `point`: the next step, what the quadratic model promises of it, and so on."""
+    """State at `point` with the next step, within a box."""
     held = jnp.zeros(point.shape, bool)
     if lower is not None:
         held |= (point <= lower) & (expansion.gradient >= 0)

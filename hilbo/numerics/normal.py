@@ -1,9 +1,9 @@
-"""The normal distribution's tail, to rounding: the one special function from which the rest of hilbo is made.
+"""Tail of the normal distribution, to rounding accuracy: the special function on which the likelihood is built.
 
 With phi the density and Q the upper tail, the hazard phi(z) / Q(z) is z plus an excess that falls from 0.8 at 0 to 1/z.
 The excess is a smooth function of (z - 4) / (z + 4) on [-1, 1]; its Chebyshev series gives tails, Mills ratios and
-truncated moments for every z >= 0 without cancellation, in float64 and float32.
-Reference: Shepherd & Laframboise (1981), Math. Comp. 36:249, who expand exp(x^2) erfc(x) in the same way.
+truncated moments for every z >= 0 without cancellation, in float64 and float32. Reference: Shepherd & Laframboise
+(1981), Math. Comp. 36:249, who expand exp(x^2) erfc(x) in the same way.
 """
 
 import math
@@ -51,7 +51,7 @@ _EXCESS_HAZARD = (
 
 
 def excess_hazard(z: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """phi(z) / Q(z) - z for z >= 0, with a relative error of a few eps; 0 at infinity. By Clenshaw's recurrence."""
+    """Excess hazard phi(z) / Q(z) - z for z >= 0, with a relative error of a few eps; 0 at infinity."""
     t = 1.0 - 8.0 / (z + 4.0)
     last, previous = jnp.zeros_like(t), jnp.zeros_like(t)
     for coefficient in _EXCESS_HAZARD[:0:-1]:

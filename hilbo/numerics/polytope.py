@@ -1,10 +1,10 @@
-"""The nearest point of a polytope, in any quadratic metric: what keeps a search between linear walls.
+"""Projection onto a polytope in any quadratic metric, for searches between linear walls.
 
     minimise (v - target)' (spread spread')^-1 (v - target)   where   normals v <= offsets,   offsets >= 0
 
-The dual active-set method: from the target, the most violated wall is taken into the active set, whose multipliers stay
-above 0 because walls that would pull are let go on the way. The end is exact, walls, edges and vertices included, and
-walls that say the same twice do no harm. Reference: Goldfarb & Idnani (1983), Math. Programming 27:1.
+Dual active-set method: starting from the target, the most violated wall enters the active set; walls whose multipliers
+would become negative leave it. The result is exact, including faces, edges and vertices, and redundant walls are
+harmless. Reference: Goldfarb & Idnani (1983), Math. Programming 27:1.
 """
 
 from typing import NamedTuple
@@ -17,28 +17,30 @@ from hilbo.numerics.linalg import cholesky, eigh, solve_lower, solve_lower_trans
 
 __all__ = ["Nearest", "Polytope", "nearest", "projector", "walls_of_cube"]
 
-_ROUNDING = 64.0  # units of eps: what a wall may be violated by, of its normal's length
-_DEPENDENT = 1e-10  # of a normal's squared length: less than that lies outside the span of the others
-_STEPS = 4  # for each wall, which bounds the search where rounding would let it go round
+_ROUNDING = 64.0  # tolerated violation of a wall, in eps times the length of its normal
+_DEPENDENT = 1e-10  # fraction of a normal's squared length outside the span of the others, below which it is dependent
+_STEPS = 4  # for each wall, as a limit in case rounding causes a cycle
 
 
 class Polytope(NamedTuple):
-    """The points w (d,) with `normals` (k, d) w <= `offsets` (k,); normals of length 1."""
+    """Polytope of the points w (d,) with `normals` (k, d) w <= `offsets` (k,); normals of length 1."""
 
     normals: Float[Array, "k d"]
     offsets: Float[Array, " k"]
 
 
 class Nearest(NamedTuple):
-    """The nearest point (d,), and the multipliers (k,) of the walls that hold it: above 0 for those."""
+    """Nearest point (d,), and the multipliers (k,) of the walls, positive for active ones."""
 
     point: Float[Array, " d"]
     multipliers: Float[Array, " k"]
 
 
 def walls_of_cube(walls: Polytope, held: Bool[Array, " d"], point: Float[Array, " d"]) -> Polytope:
-    """The walls and those of the unit cube as seen from a `point` of the polytope: normals v <= offsets for a step v
-    whose `held` coordinates stay 0. Offsets are never below 0."""
+    """The walls and those of the unit cube relative to a `point`: normals v <= offsets for a step v.
+
+    The `held` coordinates of v are 0. Offsets are never below 0, for a point of the polytope.
+    """
     unit = jnp.eye(point.size, dtype=point.dtype)
     free = jnp.where(held, 0.0, 1.0).astype(point.dtype)
     normals = jnp.concatenate([walls.normals.astype(point.dtype), unit, -unit]) * free[None, :]
@@ -47,7 +49,7 @@ def walls_of_cube(walls: Polytope, held: Bool[Array, " d"], point: Float[Array, 
 
 
 def projector(normals: Float[Array, "k d"], active: Bool[Array, " k"]) -> Float[Array, "d d"]:
-    """What leaves of a vector its part along the active walls."""
+    """Projection that removes the components of a vector along the normals of the active walls."""
     rows = jnp.where(active[:, None], normals, 0.0)
     eigenvalues, vectors = eigh(rows.T @ rows)
     free = jnp.where((eigenvalues <= _DEPENDENT)[None, :], vectors, 0.0)
@@ -55,7 +57,7 @@ def projector(normals: Float[Array, "k d"], active: Bool[Array, " k"]) -> Float[
 
 
 class _Turned(NamedTuple):
-    """The walls in coordinates in which the metric is plain."""
+    """Walls in coordinates in which the metric is Euclidean."""
 
     normals: Float[Array, "k d"]
     sizes: Float[Array, " k"]  # of the normals
@@ -64,7 +66,7 @@ class _Turned(NamedTuple):
     tolerance: Float[Array, " k"]
 
     def violations(self, multipliers: Float[Array, " k"]) -> Float[Array, " k"]:
-        """How far the point with these multipliers is beyond each wall."""
+        """Signed violation of each wall at the point with these multipliers."""
         return self.beyond - self.normals @ (self.normals.T @ multipliers)
 
 
@@ -76,8 +78,10 @@ class _State(NamedTuple):
 
 
 def nearest(walls: Polytope, target: Float[Array, " d"], spread: Float[Array, "d d"]) -> Nearest:
-    """The point between the walls that is nearest to the target. `spread` is a square root of the inverse metric, the
-    identity for plain distances."""
+    """Project the target onto the polytope.
+
+    `spread` is a square root of the inverse metric, the identity for Euclidean.
+    """
     normals = walls.normals @ spread
     sizes = jnp.sqrt(jnp.sum(normals**2, axis=1))
     eps = jnp.finfo(target.dtype).eps
@@ -95,7 +99,7 @@ def nearest(walls: Polytope, target: Float[Array, " d"], spread: Float[Array, "d
 
 
 def _step(turned: _Turned, state: _State) -> _State:
-    """Towards the entering wall, up to it, or up to where an active wall would begin to pull and is let go."""
+    """One step towards the entering wall: until it is reached, or until an active wall has to leave the set."""
     left = turned.violations(state.multipliers)
     entering = jnp.where(state.entering >= 0, state.entering, _worst(turned, state, left))
     normal = turned.normals[entering]
@@ -120,7 +124,7 @@ def _step(turned: _Turned, state: _State) -> _State:
 
 
 def _worst(turned: _Turned, state: _State, left: Float[Array, " k"]) -> Int[Array, ""]:
-    """The wall that is violated most, in units of its normal, of those that are not active."""
+    """Index of the most violated inactive wall, in units of its normal."""
     violated = turned.usable & ~state.active & (left > turned.tolerance)
     worst = jnp.argmax(jnp.where(violated, left / jnp.where(turned.usable, turned.sizes, 1.0), -jnp.inf))
     return worst.astype(state.entering.dtype)
@@ -129,7 +133,7 @@ def _worst(turned: _Turned, state: _State, left: Float[Array, " k"]) -> Int[Arra
 def _in_the_span_of(
     normals: Float[Array, "k d"], active: Bool[Array, " k"], normal: Float[Array, " d"]
 ) -> Float[Array, " k"]:
-    """The coefficients (k,) of the active normals whose sum is nearest to a normal."""
+    """Coefficients (k,) of the active normals whose combination is nearest to a normal (least squares)."""
     rows = jnp.where(active[:, None], normals, 0.0)
     gram = rows @ rows.T + jnp.diag(jnp.where(active, 0.0, 1.0).astype(rows.dtype))
     factor = cholesky(gram)

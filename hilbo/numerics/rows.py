@@ -1,4 +1,4 @@
-"""Rows of stacked arrays, outside of any trace."""
+"""Selection of rows of stacked arrays outside of `jit`."""
 
 from typing import Any, TypeVar
 
@@ -12,8 +12,10 @@ _Tree = TypeVar("_Tree")
 
 
 def rows_of(stacked: _Tree, rows: Int[np.ndarray, " k"]) -> _Tree:
-    """The same records of some rows of their arrays. Taken on the host: on the device it is a small program for each
-    shape, and tracing it takes longer than the copy."""
+    """Record with the given rows of all its arrays.
+
+    Selected on the host: on the device each shape would compile a small program, which takes longer than the copy.
+    """
 
     def taken(leaf: Any) -> Any:
         return np.asarray(leaf)[rows]

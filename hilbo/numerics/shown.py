@@ -20,8 +20,7 @@ def concrete(*values: Any) -> bool:
 
 
 def has_values(*values: Any) -> bool:
-    """Whether all are arrays with values. The fields of a record are not where it is traced, or a tree of other
-    things, as of axes for `vmap`."""
+    """Whether all are arrays with values, not tracers or other objects (a tree of `vmap` axes)."""
     return all(isinstance(value, jax.Array | np.ndarray) and not isinstance(value, Tracer) for value in values)
 
 
@@ -59,8 +58,7 @@ def check_positive(whose: str, **values: Any) -> None:
 
 
 def shown(value: Any) -> str:
-    """The text of a value: up to six numbers with four digits, a larger array by dtype and shape, a tracer as JAX
-    writes it."""
+    """Text of a value: up to six numbers with four digits; a larger array as dtype and shape."""
     if isinstance(value, Tracer) or not isinstance(value, jax.Array | np.ndarray | np.generic):
         return str(value)
     array = np.asarray(value)

@@ -1,4 +1,4 @@
-"""Scrambled Sobol points, made under jit: even fillings of the cube, independent of each other.
+"""Scrambled Sobol points under `jit`: independent low-discrepancy samples of the unit cube.
 
 Reference: Matousek (1998), J. Complexity 14:527 (random linear scramble and shift).
 """
@@ -19,10 +19,10 @@ __all__ = ["scrambled_sobol"]
 def scrambled_sobol(
     key: PRNGKeyArray, replicates: int, count: int, dim: int, dtype: DTypeLike
 ) -> Float[Array, "replicates count dim"]:
-    """Independent scrambles of the first `count` points, a power of 2, of Sobol's sequence, in (0, 1).
+    """Independent scrambles of the first `count` (a power of 2) points of Sobol's sequence, in (0, 1).
 
-    A random lower triangular matrix of bits times the generators of each dimension, and a random shift: every point is
-    uniform, and the points of a scramble fill the cube as evenly as the sequence does.
+    A random lower triangular bit matrix times the generators of each dimension, and a random shift: every point is
+    uniform, and the points of a scramble have the sequence's low discrepancy.
     """
     bits = min(30, jnp.finfo(dtype).nmant)
     generators = jnp.asarray(_generators(count, dim, bits))  # (levels, dim)
@@ -52,7 +52,10 @@ def scrambled_sobol(
 
 @functools.cache
 def _generators(count: int, dim: int, bits: int) -> np.ndarray:
-    """Sobol's generators (levels, dim) as integers, read from the sequence, which SciPy lists in Gray's order."""
+    """Sobol's generators (levels, dim) as integers, recovered from SciPy's sequence, which is in Gray-code order.
+
+    Raises `InputError` for a count that is not a power of 2.
+    """
     from scipy.stats import qmc  # imported late: slow, and only this method needs it
 
     levels = count.bit_length() - 1

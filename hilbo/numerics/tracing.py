@@ -1,4 +1,4 @@
-"""What is traced once: functions whose trace is kept, and programs that a command calls from outside of any trace."""
+"""Functions that are traced once, and compiled programs that can be cached between processes."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -18,9 +18,9 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 traced_once = functools.partial(jax.jit, inline=True)
-"""Decorator: what was traced is copied into each program that uses the function, which compiles to the same code.
+"""Decorator: the function's trace is cached and inlined into each program that uses it.
 
-For functions of arrays that programs use many times: tracing the likelihood is most of what a first fit waits for.
+For functions of arrays that programs use many times, such as the likelihood, whose tracing dominates a first fit.
 """
 
 
@@ -34,7 +34,7 @@ _keepers: list[Keeper] = []
 
 
 def keep_with(keeper: Keeper | None) -> None:
-    """From now on every call of a program is the keeper's; None: programs live as long as the process."""
+    """Set the cache for all programs of this process; None: programs live as long as the process."""
     _keepers[:] = [] if keeper is None else [keeper]
 
 
@@ -56,10 +56,10 @@ def program(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def prepared(function: Callable, *args: Any) -> OfArrays:
-    """The program of a call, to be given its arrays again and again: walking through records costs more than a short
-    program. Kept like other programs; without a keeper compiled once for all calls that differ in arrays only.
+    """Compiled program of a call, to be called repeatedly with arrays, without the cost of flattening records.
 
-    The function is one of a module, by name; calls are not part of another trace.
+    Cached like other programs; without a keeper compiled once for all calls that differ in arrays only. The function
+    must be one of a module, by name; calls must not be part of another trace.
     """
     typed = _typed(function)
     kept = _keepers[0](typed, args, {}) if _keepers else None
@@ -70,13 +70,13 @@ def prepared(function: Callable, *args: Any) -> OfArrays:
 
 
 def arrays_in(what: Any) -> tuple[Any, ...]:
-    """The arrays among its leaves, NumPy's too: what a program is given of its arguments."""
+    """Arrays among the leaves, NumPy's included: the inputs of a compiled program."""
     return tuple(leaf for leaf in jax.tree.leaves(what) if _is_array(leaf))
 
 
 @functools.lru_cache(maxsize=32)
 def _compiled(function: Callable, structure: Any, fixed: tuple[tuple[type, Any] | None, ...]) -> OfArrays:
-    """A function of the arrays among the leaves of its arguments; the other leaves are `fixed`."""
+    """Jitted function of the arrays among the leaves of the arguments; the other leaves are `fixed`."""
 
     def of_arrays(arrays):
         given = iter(arrays)
@@ -87,7 +87,7 @@ def _compiled(function: Callable, structure: Any, fixed: tuple[tuple[type, Any] 
 
 @functools.cache
 def _typed(function: Callable) -> Callable:
-    """The function, whose results have types of their own."""
+    """The function with results of strong types."""
 
     @functools.wraps(function)
     def typed(*args, **kwargs):
@@ -97,8 +97,10 @@ def _typed(function: Callable) -> Callable:
 
 
 def _strong(leaf: Any) -> Any:
+    """Leaf with a strong instead of a weak type."""
     return jnp.asarray(leaf, leaf.dtype) if getattr(leaf, "weak_type", False) else leaf
 
 
 def _is_array(leaf: Any) -> bool:
+    """Whether a leaf is an array of JAX or NumPy."""
     return isinstance(leaf, jax.Array | np.ndarray | np.generic)

@@ -40,9 +40,11 @@ _GONE = 40.0  # exp(-z^2 / 2) is 0 there in float64
 def confined_normal(
     mean: Float[Array, ""], lower: Float[Array, ""], upper: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """N(mean, 1) between two edges, which may be infinite: log of its mass there, and of what is left, confined, the
-    mean's distance from `mean` and 1 - variance; the latter are also the first and minus the second derivative of the
-    log mass in `mean`."""
+    """Log mass of N(mean, 1) between two edges, and shift of the mean and reduction of the variance by truncation.
+
+    Edges may be infinite. The shift (truncated mean - `mean`) is also the first, and 1 - variance minus the second
+    derivative of the log mass in `mean`.
+    """
     truncated = truncated_normal(mean, lower, upper, jnp.ones_like(mean))
     return truncated.log_mass, truncated.mean, truncated.curvature
 
@@ -135,7 +137,7 @@ def _choose(
     conditions: tuple[Bool[Array, ""], Bool[Array, ""]],
     values: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
 ) -> Float[Array, ""]:
-    """The first value where the first condition holds, the second where the second does, else the third."""
+    """Value of the first regime whose condition is true, else the third."""
     return jnp.where(conditions[0], values[0], jnp.where(conditions[1], values[1], values[2]))
 
 

@@ -1,4 +1,4 @@
-"""How far apart points of the unit cube are, where some coordinates are unordered levels."""
+"""Distances between points of the unit cube, of which some coordinates may be categorical."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ __all__ = ["differences", "levels_of", "middle_of", "nrmse"]
 
 
 def levels_of(parameters: Sequence[Parameter]) -> tuple[int, ...]:
-    """For each coordinate its number of unordered levels, 0 for numbers; empty where all are numbers."""
+    """Number of unordered levels of each coordinate, 0 for numeric ones; empty if all are numeric."""
     counts = tuple(p.steps if p.levels else 0 for p in parameters)
     return counts if any(counts) else ()
 
@@ -21,9 +21,9 @@ def levels_of(parameters: Sequence[Parameter]) -> tuple[int, ...]:
 def differences(
     levels: tuple[int, ...], x: Float[Any, "*#batch d"], y: Float[Any, "*#batch d"], apart: float = 1.0
 ) -> Float[Any, "... d"]:
-    """x - y, coordinate by coordinate: (..., d); of unordered levels `apart` where they differ, whichever they are.
+    """x - y by coordinate, (..., d); for categorical coordinates `apart` if the levels differ, else 0.
 
-    `levels`: as `levels_of` has them.
+    `levels`: as from `levels_of`.
     """
     if not levels:
         return x - y
@@ -39,14 +39,13 @@ def differences(
 
 
 def nrmse(x: Float[Any, "*#batch d"], y: Float[Any, "*#batch d"], levels: tuple[int, ...] = ()) -> Float[Array, "..."]:
-    """Root-mean-square difference of parameter sets in units of their search ranges: of points of the unit cube, by
-    `differences`. `x`, `y` (..., d) -> (...,)."""
+    """NRMSE between points of the unit cube: root mean square of `differences`. `x`, `y` (..., d) -> (...,)."""
     away = differences(levels, np.asarray(x), np.asarray(y))
     return to_device(np.sqrt(np.mean(away**2, axis=-1)))
 
 
 def middle_of(levels: tuple[int, ...], x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " d"]:
-    """The mean of points, coordinate by coordinate: (d,); of unordered levels the commonest."""
+    """Mean of points by coordinate, (d,); for categorical coordinates the most frequent level."""
     middle = x.mean(axis=0)
     for i in (i for i, count in enumerate(levels) if count):
         values, counts = np.unique(x[:, i], return_counts=True)

@@ -1,4 +1,4 @@
-"""Candidate points of the unit cube, among which a function is maximised before the best of them are polished."""
+"""Candidate points of the unit cube for maximising a function; the best of them are refined afterwards."""
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -9,12 +9,12 @@ from hilbo.search.space import SearchSpace
 __all__ = ["CANDIDATES", "search_points"]
 
 CANDIDATES = 4096
-"""Points inside the feasible set among which a function is maximised before polishing; a quarter more on its walls."""
+"""Number of candidates inside the feasible set; a quarter more lie on its boundary."""
 
 
 def search_points(space: SearchSpace, seed: int, count: int = CANDIDATES) -> Float[Array, "m d"]:
-    """Points of the unit cube among which to look for a maximum: `count` inside the feasible set, a quarter of that
-    on its walls, edges and corners.
+    """Candidate points of the unit cube: `count` inside the feasible set, a quarter of that on its boundary.
+
     -> (`count` + `count` // 4, d).
     """
     return to_device(np.concatenate([space.candidates(count, seed), space.walls(count // 4, seed)]))

@@ -37,7 +37,7 @@ _Batch = Float[Array, "*batch"]
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of K1 in a box of these parameters; `constraints`: those that name K1.
+    """Feasible intervals of K1 (columns) given the other parameters; `constraints`: those that involve K1.
 
     Points are (..., d), in the unit cube; their own K1 has no influence on the ends of its column.
     """
@@ -48,16 +48,16 @@ class Columns:
 
     @property
     def drawn(self) -> "Columns":
-        """The columns from which even points are drawn: their ends follow from B1 and alpha alone."""
+        """Columns from which uniform points are drawn: those whose ends depend on B1 and alpha alone."""
         alone = (c for c in self.constraints if all(name in _MODEL for name, weight in c.terms if weight))
         return dataclasses.replace(self, constraints=tuple(alone))
 
     def index(self, name: str) -> int:
-        """Which coordinate a parameter is."""
+        """Index of a parameter."""
         return next(i for i, parameter in enumerate(self.parameters) if parameter.name == name)
 
     def from_shares(self, w: Float[Array, "*batch d"]) -> Float[Array, "*batch d"]:
-        """Points of which K1 is a share of its column, as points of the unit cube; x_K1 is 0 in an empty column."""
+        """Map points whose K1 is a fraction of its column to the unit cube; x_K1 is 0 in an empty column."""
         K1 = self.index("K1")
         if not self.between:
             return w.at[..., K1].multiply(self.passive_end(w))
@@ -65,8 +65,7 @@ class Columns:
         return w.at[..., K1].set(start + w[..., K1] * width)
 
     def to_shares(self, w: Float[Array, "*batch d"], x: Float[Array, "*batch d"]) -> Float[Array, "*batch d"]:
-        """Points `w` with their x_K1 as a share of its column: of the columns of the same points `x` in the unit cube,
-        which are feasible."""
+        """Inverse of `from_shares`: K1 of the points `w` as a fraction of the columns of the same points `x`."""
         K1 = self.index("K1")
         if not self.between:
             return w.at[..., K1].divide(self.passive_end(x))
@@ -74,7 +73,7 @@ class Columns:
         return w.at[..., K1].set((x[..., K1] - start) / width)
 
     def passive_end(self, x: Float[Array, "*batch d"]) -> _Batch:
-        """The largest passive x_K1 (...,) in the columns of points, 0 where there is none."""
+        """Largest passive x_K1 (...,) in the columns of points, 0 if there is none."""
         K1, B1, alpha = (self.index(name) for name in ("K1", "B1", "alpha"))
         physical = (self.parameters[i].to_physical(x[..., i]) for i in (B1, alpha))
         low, high = self.parameters[K1].low, self.parameters[K1].high
@@ -96,7 +95,7 @@ class Columns:
 
 @program
 def column_ends(columns: Columns, x: Float[ArrayLike, "*batch d"]) -> tuple[_Batch, _Batch]:
-    """Both ends (...,) in x_K1 of the columns of points (..., d); equal in an empty one."""
+    """Lower and upper end (...,) in x_K1 of the columns of points (..., d); equal for an empty one."""
     x = jnp.asarray(x, jnp.result_type(1.0, x))
     if not columns.between:
         end = columns.passive_end(x)
@@ -107,7 +106,7 @@ def column_ends(columns: Columns, x: Float[ArrayLike, "*batch d"]) -> tuple[_Bat
 
 @functools.lru_cache(maxsize=16)
 def column_table(columns: Columns) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
-    """Both ends of the columns, (B1, α), on a grid: at the x_B1 `ROWS` and the x_alpha `COLUMNS`."""
+    """Table of both ends of the columns on a grid of x_B1 (`ROWS`) and x_alpha (`COLUMNS`)."""
     x = np.full((_CELLS + 1, _CELLS + 1, len(columns.parameters)), 0.5)
     x[..., columns.index("B1")], x[..., columns.index("alpha")] = ROWS[:, None], COLUMNS
     start, end = column_ends(columns, x)
@@ -116,7 +115,7 @@ def column_table(columns: Columns) -> tuple[Float[np.ndarray, "r c"], Float[np.n
 
 @functools.lru_cache(maxsize=16)
 def _cumulative_volume(columns: Columns) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "cells c"]]:
-    """Cumulative volume of the columns: over the rows of B1, and within each row over α, there from 0 to 1."""
+    """Cumulative volume of the columns: over the rows of B1, and within each row over α, normalised."""
     start, end = column_table(columns)
     node = end - start
     mean = (node[1:, 1:] + node[1:, :-1] + node[:-1, 1:] + node[:-1, :-1]) / 4
@@ -128,13 +127,15 @@ def _cumulative_volume(columns: Columns) -> tuple[Float[np.ndarray, " r"], Float
 
 
 def volume(columns: Columns) -> float:
-    """Share of the unit cube that the columns fill: their mean width, on a grid. The columns are `drawn`."""
+    """Fraction of the unit cube that the columns fill: their mean width, on a grid. For `drawn` columns."""
     return float(_cumulative_volume(columns)[0][-1])
 
 
 def rosenblatt(columns: Columns, uniform: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """Uniform numbers (n, d) as points of which K1 is a share of its column, where a column is as likely as it is
-    wide. The columns are `drawn`."""
+    """Map uniform numbers (n, d) to points whose K1 is a fraction of its column; density proportional to its width.
+
+    For `drawn` columns.
+    """
     rows, within = _cumulative_volume(columns)
     B1, alpha = columns.index("B1"), columns.index("alpha")
     w = uniform.copy()
@@ -147,7 +148,7 @@ def rosenblatt(columns: Columns, uniform: Float[np.ndarray, "n d"]) -> Float[np.
 
 
 def check_volume(columns: Columns) -> None:
-    """Refuse mechanics that leave every column empty. Raises `InputError`."""
+    """Raise `InputError` if every column is empty."""
     if volume(columns) > 0:
         return
     mechanics, K1 = columns.mechanics, columns.parameters[columns.index("K1")]

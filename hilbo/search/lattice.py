@@ -1,18 +1,18 @@
-"""An acquisition function on a tensor grid of the unit cube, without most of the exponentials and the variances.
+"""Screening of an acquisition function on a tensor grid of the unit cube, with few exponentials and variances.
 
-Where a kernel is a product over coordinates, its values on a grid of g nodes per coordinate are products of n·d·g
+For a kernel that is a product over coordinates, its values on a grid of g nodes per coordinate are products of n·d·g
 numbers, and the posterior mean at all g^d nodes is one matrix product (n, g)' (n, g^(d-1)): no exponential per pair.
-The nodes of one *column* differ in one coordinate only. With mechanics that is K1, and a column ends at the passive
-wall, which no grid meets: its ends are points of their own.
+The nodes of one *column* differ in one coordinate only. With mechanics that is K1, and a column ends at the passivity
+boundary, between grid points: its ends are additional points.
 
-A variance is computed only where it may matter. A score is at most what it would be with the best variance between 0
-and the prior's (`optimistic`), so that columns whose bound is below a value already found cannot hold the maximum;
-columns are taken in the order of their bounds, `_BATCH` at a time, until the next bound is below the best value.
-The maximum over the lattice is the same as if every variance had been computed, to the rounding of the numbers.
+A variance is computed only where it may matter. A score has an upper bound over all variances between 0 and the prior's
+(`optimistic`), so that columns whose bound is below a value already found cannot contain the maximum; columns are
+processed in the order of their bounds, `_BATCH` at a time, until the next bound is below the best value. The maximum
+over the lattice is the same as if every variance had been computed, to rounding.
 
-A maximum between nodes is higher than they are. Where nothing was asked, a score is as high as its bound, and flat: no
-climb leads anywhere, yet a thousand such nodes may be above those beside a small hill that data raise. So other points
-than the highest are ranked by *hope*, the value and a share of what it lacks to the bound.
+A maximum between nodes is higher than the nodes. In regions without data a score equals its bound, and is flat: no
+local search improves it, yet a thousand such nodes may exceed those near a small mode that data support. So points
+other than the maximum are ranked by *hope*, the value plus a fraction of its distance to the bound.
 """
 
 import math
@@ -37,12 +37,15 @@ _SLACK = 16.0  # rounding errors of a mean, in units of eps times the sum of its
 
 @runtime_checkable
 class OptimisticScore(Protocol):
-    """A score of means and variances that can bound itself."""
+    """Score of posterior means and variances that has an upper bound over variances."""
 
     def __call__(self, mean: Float[Array, "..."], variance: Float[Array, "..."], /) -> Float[Array, "..."]: ...
 
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""], /) -> Float[Array, "..."]:
-        """The largest score with this mean and any variance between 0 and `prior`; does not fall with the mean."""
+        """Upper bound of the score given the posterior mean, over variances from 0 to `prior`.
+
+        Non-decreasing in the mean.
+        """
         ...
 
 
@@ -63,7 +66,7 @@ class Lattice(eqx.Module):
     dim: int = eqx.field(static=True)
 
     def points(self, row: Int[Array, "*k"], column: Int[Array, "*k"]) -> Float[Array, "*k d"]:
-        """Points (..., d) of the unit cube: `row` counts the nodes of a column, then its ends."""
+        """Points (..., d) of the unit cube; `row` counts the nodes of a column, then its ends."""
         count = self.nodes.shape[0]
         at_node = self.nodes[jnp.minimum(row, count - 1)]
         height = at_node
@@ -76,7 +79,7 @@ class Lattice(eqx.Module):
         return jnp.stack(coordinates, axis=-1)
 
     def everywhere(self) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:
-        """All points (m, d), and which of them are feasible."""
+        """All points (m, d), and the mask of the feasible ones."""
         usable = jnp.concatenate([self.inside, self.present])
         of_lattice = self.points(*jnp.indices(usable.shape)).reshape(-1, self.dim)
         points = jnp.concatenate([of_lattice, self.extra.astype(of_lattice.dtype)])
@@ -84,7 +87,7 @@ class Lattice(eqx.Module):
 
 
 def nodes_for(theta: float) -> int:
-    """Nodes per coordinate for a kernel with this (largest) theta: about three per length scale, 12 to 32."""
+    """Number of nodes per coordinate for a kernel with this (largest) theta: about three per length scale, 12 to 32."""
     return min(max(1 + math.ceil(_PER_LENGTH * math.sqrt(2.0 * theta)), _FEWEST), _MOST)
 
 
@@ -109,10 +112,10 @@ def screen(
     score: OptimisticScore,
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
 ) -> Screened:
-    """The maximum over a lattice, and where else to look.
+    """Maximise a score over a lattice, and return starting points for local searches.
 
-    **Arguments:** the `kernel`, asked points `x` (n, d), `weights` and `factor` of a posterior; `allowed`: which
-    points may be chosen at all, e.g. none too near to earlier ones.
+    **Arguments:** the `kernel`, observed points `x` (n, d), `weights` and `factor` of a posterior; `allowed`: which
+    points may be chosen, e.g. none too close to earlier ones.
     """
     usable, may = jnp.concatenate([lattice.inside, lattice.present]), jnp.ones(lattice.extra.shape[:1], bool)
     if allowed is not None:
@@ -145,7 +148,7 @@ class _Found(NamedTuple):
 
 
 def _best_first(columns: "_Columns", highest: Float[Array, ""]) -> _Found:
-    """Columns get variances, the largest bounds first, while they may hold a value above the `highest` yet."""
+    """Evaluate columns in the order of their bounds, while they may contain a value above `highest`."""
 
     def step(state):
         _, chosen = jax.lax.top_k(state.bounds, min(_BATCH, state.bounds.shape[0]))
@@ -185,7 +188,7 @@ class _Columns(eqx.Module):
     values: "_Values"
 
     def bounds(self) -> Float[Array, " c"]:
-        """What no score in a column exceeds."""
+        """Upper bound of the score in each column."""
         weights = self.values.weights
         at_nodes = (self.down * weights[None, :]) @ self.across
         at_ends = weights @ (self.across[:, None, :] * self.ends).reshape(len(weights), -1)
@@ -193,7 +196,7 @@ class _Columns(eqx.Module):
         return jnp.max(jnp.where(self.usable, self.values.bound(mean), -jnp.inf), axis=0)
 
     def evaluate(self, chosen: Int[Array, " b"]) -> tuple[Float[Array, "r b"], Float[Array, "r b"]]:
-        """Values and hopes of some columns."""
+        """Values and hopes at the nodes and ends of the `chosen` columns."""
         across = self.across[:, chosen][:, None, :]
         cross = jnp.concatenate([self.down.T[:, :, None] * across, self.ends[:, :, chosen] * across], axis=1)
         scores = self.values(cross.reshape(len(cross), -1))
@@ -210,7 +213,7 @@ def screen_points(
     score: OptimisticScore,
     batch: int = 512,
 ) -> Float[Array, " m"]:
-    """Values (m,) of a score at any points, -inf at those that cannot hold the maximum and got no variance."""
+    """Values (m,) of a score at arbitrary points; -inf at points that cannot be the maximum and were not evaluated."""
     value_of = _Values(kernel.diagonal(x[0]), factor, weights, score)
 
     def evaluate(state):
@@ -226,7 +229,7 @@ def screen_points(
 
 
 class _Values(eqx.Module):
-    """A score where the prior covariances with the asked points are the columns of `cross`."""
+    """Score as a function of the prior covariances `cross` with the observed points."""
 
     prior: Float[Array, ""]
     factor: Float[Array, "n n"]
@@ -234,12 +237,12 @@ class _Values(eqx.Module):
     score: OptimisticScore
 
     def bound(self, mean: Float[Array, "..."]) -> Float[Array, "..."]:
-        """What no score exceeds where the posterior mean is `mean`, but for its rounding."""
+        """Upper bound of the score given the posterior mean, with a margin for rounding."""
         slack = _SLACK * jnp.finfo(mean.dtype).eps * jnp.sum(jnp.abs(self.weights)) * self.prior
         return self.score.optimistic(mean + slack, self.prior)
 
     def __call__(self, cross: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Values and hopes."""
+        """Values and hopes at the columns of `cross`; -inf if the score is not a number."""
         product = jnp.concatenate([self.factor, self.weights[None, :]]) @ jax.lax.optimization_barrier(cross)
         mean, left = product[-1], self.prior - jnp.sum(product[:-1] ** 2, axis=0)
         # Rounding may leave less than nothing of a variance, and these numbers only rank; what is none ranks last.

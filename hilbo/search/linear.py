@@ -26,8 +26,10 @@ _CHAINS, _BURN_IN, _APART = 512, 200, 20  # steps of hit and run
 
 
 class Walls(NamedTuple):
-    """Points w (d,) with `normals` (k, d) w <= `offsets` (k,), normals of length 1; `source`: the number of the
-    constraint, from 1."""
+    """Polytope of the points w (d,) with `normals` (k, d) w <= `offsets` (k,), normals of length 1.
+
+    `source`: number of the constraint of each wall, from 1.
+    """
 
     normals: Float[np.ndarray, "k d"]
     offsets: Float[np.ndarray, " k"]
@@ -35,7 +37,7 @@ class Walls(NamedTuple):
 
 
 def rows_of(parameters: Sequence[Parameter], constraints: Sequence[Constraint], without: str | None = None) -> Walls:
-    """The constraints as walls in linear units of the ranges; but for those that name the parameter `without`."""
+    """Constraints as walls in linear units of the ranges, except those that involve the parameter `without`."""
     names, low = [p.name for p in parameters], np.array([p.low for p in parameters])
     width = np.array([p.high for p in parameters]) - low
     normals, offsets, source = [], [], []
@@ -55,8 +57,7 @@ def rows_of(parameters: Sequence[Parameter], constraints: Sequence[Constraint], 
 
 
 def check_room(parameters: Sequence[Parameter], constraints: Sequence[Constraint]) -> None:
-    """Refuse constraints that leave nothing of the ranges, or an edge of them, alone, in pairs or together. Raises
-    `InputError`."""
+    """Raise `InputError` for constraints that leave no volume of the ranges, alone, in pairs or together."""
     if _radius(rows_of(parameters, constraints))[0] > _LEAST:
         return
     numbers = range(1, len(constraints) + 1)
@@ -79,11 +80,12 @@ def check_room(parameters: Sequence[Parameter], constraints: Sequence[Constraint
 
 
 def _ordinal(number: int) -> str:
+    """Ordinal number in words."""
     return {1: "first", 2: "second", 3: "third"}.get(number, f"{number}th")
 
 
 def _radius(walls: Walls) -> tuple[float, Float[np.ndarray, " d"]]:
-    """Radius and middle of the largest ball between the walls and those of the cube; below 0 where there is none."""
+    """Radius and centre of the largest ball between the walls within the cube; radius below 0 if there is none."""
     from scipy.optimize import linprog  # slow to import, and only studies with constraints need it
 
     normals, offsets = _with_cube(walls)
@@ -94,6 +96,7 @@ def _radius(walls: Walls) -> tuple[float, Float[np.ndarray, " d"]]:
 
 
 def _with_cube(walls: Walls) -> tuple[Float[np.ndarray, "r d"], Float[np.ndarray, " r"]]:
+    """Normals and offsets of the walls and of the unit cube."""
     d = walls.normals.shape[1]
     return (
         np.concatenate([walls.normals, np.eye(d), -np.eye(d)]),
@@ -102,7 +105,7 @@ def _with_cube(walls: Walls) -> tuple[Float[np.ndarray, "r d"], Float[np.ndarray
 
 
 def inside(walls: Walls, count: int, seed: int) -> Iterator[Float[np.ndarray, "n d"]]:
-    """Chunks of `count` points or more, uniform between the walls and within the cube."""
+    """Yield chunks of at least `count` points, uniform between the walls within the cube, by hit and run."""
     rng, (_, middle) = np.random.default_rng(seed), _radius(walls)
     w = np.tile(middle, (_CHAINS, 1))
     for _ in range(_BURN_IN):
@@ -117,14 +120,14 @@ def inside(walls: Walls, count: int, seed: int) -> Iterator[Float[np.ndarray, "n
 
 
 def _hit(walls: Walls, w: Float[np.ndarray, "n d"], rng: np.random.Generator) -> Float[np.ndarray, "n d"]:
-    """A uniform point on a random line through each point."""
+    """One step of hit and run: a uniform point on a random line through each point."""
     direction = rng.standard_normal(w.shape)
-    ahead, behind = (_reach(*_with_cube(walls), w, side * direction)[0] for side in (1.0, -1.0))
+    ahead, behind = (_distance_to_wall(*_with_cube(walls), w, side * direction)[0] for side in (1.0, -1.0))
     return w + (rng.random(len(w)) * (ahead + behind) - behind)[:, None] * direction
 
 
-def _reach(normals, offsets, w, direction) -> tuple[Float[np.ndarray, " n"], np.ndarray]:
-    """How far each point may go in its direction, and the row of the wall that it then meets."""
+def _distance_to_wall(normals, offsets, w, direction) -> tuple[Float[np.ndarray, " n"], np.ndarray]:
+    """Distance from each point to the boundary in its direction, and the row of the wall there."""
     speed, left = direction @ normals.T, np.maximum(offsets - w @ normals.T, 0.0)
     moving = speed > 1e-12
     lengths = np.where(moving, left / np.where(moving, speed, 1.0), np.inf)
@@ -134,8 +137,11 @@ def _reach(normals, offsets, w, direction) -> tuple[Float[np.ndarray, " n"], np.
 def ends_of_rays(
     walls: Walls, w: Float[np.ndarray, "n d"], free: Bool[np.ndarray, " d"], seed: int, shares: Sequence[float]
 ) -> Float[np.ndarray, "n d"]:
-    """Points on the walls: from each point a random ray to its end, from there another along the wall that it met, and
-    so on; `shares` of them after one wall, two, and so on, the rest at corners. What is not `free` stays."""
+    """Points on the walls: from each point along a random ray to a wall, then along that wall to the next, and so on.
+
+    `shares`: fraction of the points that stop after one wall, after two, and so on; the rest end at corners.
+    Coordinates that are not `free` stay fixed.
+    """
     rng, (normals, offsets) = np.random.default_rng(seed), _with_cube(walls)
     d = int(free.sum())
     if d == 0:
@@ -147,7 +153,7 @@ def ends_of_rays(
     for turn in range(d):
         direction = rng.standard_normal(w.shape)
         direction -= np.einsum("nij,nj->ni", np.linalg.pinv(met, rcond=1e-9) @ met, direction)
-        length, row = _reach(normals, offsets, w, direction)
+        length, row = _distance_to_wall(normals, offsets, w, direction)
         going = (turn < ends) & np.isfinite(length) & (np.linalg.norm(direction, axis=1) > 1e-9)
         w = np.where(going[:, None], w + np.where(going, length, 0.0)[:, None] * direction, w)
         new = np.flatnonzero(going)

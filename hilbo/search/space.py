@@ -1,18 +1,18 @@
-"""The space that is searched: named parameters, the unit cube, and the part of it that is feasible.
+"""Search space: named parameters, the unit cube, and its feasible part.
 
-Three coordinates of one point:
+Three coordinate systems:
 
-- *physical*: the numbers of tables and devices, in the units of the parameters; of a level its place in the list;
-- *unit cube* x: every parameter on [0, 1] over its full range, linear or logarithmic; kernels see only these;
+- *physical*: the numbers of tables and devices, in the units of the parameters; of a level its position in the list;
+- *unit cube* x: every parameter on [0, 1] over its full range, linear or logarithmic; the kernels' coordinates;
 - *box* w: the optimiser's coordinates, in which the feasible set is a polytope within [0, 1]^d. With mechanics, w_K1 is
-  the share of a column along K1, from its first feasible point to its last (`columns`). A parameter in a linear
+  the fraction of a column along K1, from its first feasible point to its last (`columns`). A parameter in a linear
   constraint is linear in its unit (`linear`); all others are w = x.
 
 Without constraints the polytope is the whole cube. With mechanics, a constraint on K1 bounds its column instead. Whole
-numbers and levels are steps of their coordinate: a search changes the others, then tries `neighbours`.
+numbers and levels are discrete coordinates: a search changes the others, then tries `neighbours`.
 
-Points that fill the feasible set evenly come from uniform numbers: by the widths of the columns with mechanics, by
-refusing or by hit and run between the walls of constraints.
+Uniform points of the feasible set are transformed uniform numbers: by the widths of the columns with mechanics, by
+rejection or by hit and run between the walls of constraints.
 """
 
 import dataclasses
@@ -40,7 +40,7 @@ from hilbo.search.steps import neighbours, steps_of
 __all__ = ["Bound", "SearchSpace", "share_of_cube"]
 
 Bound = Literal["constraint", "passive boundary", "effective damping"]
-"""What, within the ranges, a rendering may be beyond."""
+"""Boundary of the feasible set, within the ranges, that a point may violate."""
 
 _ROOMY, _PILOT = 0.02, 4096  # share of the cube, of so many points, from which constrained points are drawn in it
 _CLUSTERED = 200  # points for each of a space-filling design between walls
@@ -78,7 +78,7 @@ class SearchSpace(eqx.Module):
 
     @property
     def discrete(self) -> tuple[bool, ...]:
-        """Which parameters have steps: whole numbers and levels."""
+        """Mask of the discrete parameters: whole numbers and levels."""
         return tuple(parameter.discrete for parameter in self.parameters)
 
     @property
@@ -88,7 +88,7 @@ class SearchSpace(eqx.Module):
 
     @property
     def searched(self) -> dict[str, Any]:
-        """What a maximisation over this space is given (`acquisition.maximise`)."""
+        """Keyword arguments that describe this space to `acquisition.maximise`."""
         functions = {"from_box": self.from_box, "to_box": self.to_box, "feasible": self.feasible}
         if self.even:
             return functions
@@ -102,7 +102,7 @@ class SearchSpace(eqx.Module):
 
     @property
     def columns(self) -> Columns | None:
-        """Along K1, with mechanics; None without."""
+        """Columns along K1 with mechanics, else None."""
         if self.mechanics is None:
             return None
         on_K1 = (c for c in self.constraints if any(name == "K1" and weight for name, weight in c.terms))
@@ -110,29 +110,29 @@ class SearchSpace(eqx.Module):
 
     @property
     def _drawn(self) -> Columns | None:
-        """From which even points are drawn."""
+        """Columns from which uniform points are drawn; None without mechanics."""
         return None if self.columns is None else self.columns.drawn
 
     @property
     def _passive(self) -> Columns:
-        """Along K1, whatever the constraints."""
+        """Columns along K1 without regard to the constraints."""
         assert self.mechanics is not None
         return Columns(self.parameters, self.mechanics)
 
     @property
     def _walls(self) -> linear.Walls:
-        """In box coordinates; of K1, whose column is bounded instead, there is none."""
+        """Walls of the constraints in box coordinates, except those on K1, which bound its column instead."""
         return linear.rows_of(self.parameters, self.constraints, None if self.mechanics is None else "K1")
 
     @property
     def _linear(self) -> tuple[bool, ...]:
-        """Which parameters are linear in the box, and logarithmic in the unit cube."""
+        """Mask of the parameters that are linear in the box, and logarithmic in the unit cube."""
         named = {name for constraint in self.constraints for name, weight in constraint.terms if weight}
         named -= set() if self.mechanics is None else {"K1"}
         return tuple(p.name in named and p.scale == "log" for p in self.parameters)
 
     def _check_axis(self, points: Any) -> None:
-        """Raises `InputError` for points with another number of coordinates: JAX would take the last one twice."""
+        """Raise `InputError` for points with another number of coordinates, which JAX would accept silently."""
         shape = np.shape(points)
         if not shape or shape[-1] != self.dim:
             raise InputError(
@@ -181,10 +181,9 @@ class SearchSpace(eqx.Module):
         return w if self.columns is None else self.columns.to_shares(w, x)
 
     def feasible(self, x: Real[ArrayLike, "*batch d"]) -> Bool[Array, "*batch"]:
-        """Whether points of the unit cube are in the box, passive with the search margin, damped as asked for, and
-        within the constraints as their values are rendered.
+        """Whether points of the unit cube are in the box, passive with the search margin, and within all constraints.
 
-        (..., d) -> (...,).
+        Including the range of effective damping. Discrete parameters are rounded first. (..., d) -> (...,).
         """
         self._check_axis(x)
         plain = self.mechanics is None and not self.constraints
@@ -200,7 +199,7 @@ class SearchSpace(eqx.Module):
         return inside
 
     def broken(self, x: Real[ArrayLike, " d"]) -> Bound | None:
-        """What a point (d,) within the unit cube is beyond; None where it is feasible."""
+        """Name of the boundary that a point (d,) of the unit cube violates; None if it is feasible."""
         physical = self._split(self.to_physical(_on_device(x)))
         if not all(keeps(constraint, physical) for constraint in self.constraints):
             return "constraint"
@@ -209,25 +208,25 @@ class SearchSpace(eqx.Module):
         return "effective damping" if passive(self.mechanics, physical) else "passive boundary"
 
     def derived(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> dict[str, Float[Array, "..."]]:
-        """What follows from the parameters: K0 (N/mm) with mechanics, nothing without.
+        """Derived parameters: K0 (N/mm) with mechanics, none without.
 
-        Parameter -> values in its unit, of one shape; the results have that shape.
+        `physical`: parameter -> values in its unit, of one shape; the results have that shape.
         """
         return {} if self.mechanics is None else {"K0": K0_of(self.mechanics, physical)}
 
     def passivity_margin(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> Float[Array, "..."] | None:
-        """Damping of the device less the smallest passive one, N·s/m; None without mechanics.
+        """Passivity margin: damping of the device minus the smallest passive damping, N·s/m; None without mechanics.
 
-        Parameter -> values in its unit, of one shape; so is the result.
+        `physical`: parameter -> values in its unit, of one shape; so is the result.
         """
         return None if self.mechanics is None else self.mechanics.damping - minimum_damping(self.mechanics, physical)
 
     def volume(self) -> float:
-        """Share of the unit cube that is passive: the mean width of its columns, on a grid; 1 without mechanics."""
+        """Passive fraction of the unit cube: the mean width of its columns, on a grid; 1 without mechanics."""
         return 1.0 if self.mechanics is None else volume(self._passive)
 
     def without_delay(self) -> "SearchSpace":
-        """The same space as if every force came at once; itself where it does."""
+        """The space for a force without delay; itself if it has none."""
         if self.mechanics is None or not self.mechanics.delay:
             return self
         return dataclasses.replace(self, mechanics=dataclasses.replace(self.mechanics, delay=0.0))
@@ -242,7 +241,10 @@ class SearchSpace(eqx.Module):
         return _take_feasible(self, m, sobol_chunks(self.dim, m, seed), self._drawn)
 
     def walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
-        """`m` points on the walls, edges and corners of the feasible set, the passive boundary included. -> (m, d)."""
+        """`m` points on the boundary of the feasible set (walls, edges, corners), including the passivity boundary.
+
+        -> (m, d).
+        """
         if self.constraints and self.mechanics is None:
             return self._on_walls(m, seed)
         count = 2 ** max(m - 1, 0).bit_length()
@@ -269,6 +271,7 @@ class SearchSpace(eqx.Module):
         return np.where(np.asarray(feasible)[:, None], np.asarray(x), starts)
 
     def _split(self, physical: Float[Array, "*batch d"]) -> dict[str, Float[Array, "*batch"]]:
+        """Coordinates by parameter name."""
         return {name: physical[..., i] for i, name in enumerate(self.names)}
 
 
@@ -278,13 +281,13 @@ def _on_device(x: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
 
 @functools.lru_cache(maxsize=16)
 def share_of_cube(space: SearchSpace) -> float:
-    """The share of even points of the unit cube that is feasible, from some thousand."""
+    """Feasible fraction of the unit cube, estimated from 4096 points."""
     points = next(sobol_chunks(space.dim, _PILOT, 0))
     return float(np.asarray(_feasible(space, steps_of(space.parameters, points))).mean())
 
 
 def _take_between(space: SearchSpace, count: int, seed: int) -> Float[np.ndarray, "count d"]:
-    """`count` feasible points of the unit cube, evenly between the walls of constraints without mechanics."""
+    """Draw `count` uniform feasible points of the unit cube, with constraints and without mechanics."""
     chunks = sobol_chunks(space.dim, count, seed)
     if share_of_cube(space) < _ROOMY:
         chunks = (np.asarray(_from_box(space, w)[0]) for w in linear.inside(space._walls, count, seed))
@@ -324,8 +327,10 @@ def _from_columns(
 def _take_feasible(
     space: SearchSpace, count: int, chunks: Chunks, columns: Columns | None, hold: Chunks | None = None
 ) -> Float[np.ndarray, "count d"]:
-    """The first `count` feasible points out of chunks of uniform numbers, K1 within `columns`, some coordinates held at
-    an end."""
+    """Take the first `count` feasible points out of chunks of uniform numbers.
+
+    K1 is within `columns`; `hold`: chunks with the coordinates that are fixed at an end.
+    """
 
     def place(uniform):
         w = uniform if columns is None else rosenblatt(columns.drawn, uniform)
@@ -342,7 +347,7 @@ def _take_feasible(
 def _enough(
     space: SearchSpace, count: int, kept: list[Float[np.ndarray, "_ d"]], taken: int, tried: int
 ) -> Float[np.ndarray, "count d"]:
-    """The points that were taken. Raises `InputError` for fewer than `count`."""
+    """Concatenate the points. Raises `InputError` for fewer than `count`."""
     if taken < count:
         left = f"{taken} of {tried} {'points' if space.mechanics is None else 'passive points'}, too few to search"
         if space.constraints:

@@ -1,7 +1,7 @@
-"""Streams of points in the unit cube, in chunks of growing size, from which a search space takes those it can use.
+"""Streams of points in the unit cube, in chunks of growing size, from which a search space takes the feasible ones.
 
-Low-discrepancy points (scrambled Sobol'), Latin hypercubes, and points on the walls, edges and corners: a function
-that grows away from the data has its maximum there, and no number of points inside finds it.
+Low-discrepancy points (scrambled Sobol'), Latin hypercubes, and points on the walls, edges and corners: a function that
+increases away from the data has its maximum there, which interior points never reach.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,7 +14,7 @@ __all__ = ["HELD", "crossings", "latin_chunks", "sobol_chunks", "spread_out", "t
 Chunks = Iterator[Float[np.ndarray, "n d"]]
 
 LEAST_SHARE = 1e-4
-"""`take` gives up where fewer of the points are usable."""
+"""Usable fraction of the points below which `take` gives up."""
 _LARGEST_CHUNK = 2**18
 HELD = (0.7, 0.2, 0.1)  # shares of the wall points with one, two and three coordinates at an end
 
@@ -22,9 +22,9 @@ HELD = (0.7, 0.2, 0.1)  # shares of the wall points with one, two and three coor
 def take(
     count: int, chunks: Chunks, place: Callable[[np.ndarray], tuple[Float[np.ndarray, "n d"], Bool[np.ndarray, " n"]]]
 ) -> tuple[list[Float[np.ndarray, "_ d"]], int, int]:
-    """The first `count` usable points, in parts; how many were found, and how many were tried.
+    """Take the first `count` usable points, in parts; also return how many were found, and how many were tried.
 
-    `place` turns a chunk into points and says which are usable. Fewer than `count` are found only where less than
+    `place` converts a chunk into points and a mask of the usable ones. Fewer than `count` are found only if less than
     `LEAST_SHARE` is usable.
     """
     kept, usable_count, tried = [], 0, 0
@@ -53,7 +53,7 @@ def latin_chunks(dim: int, count: int, seed: int) -> Chunks:
 
 
 def wall_chunks(dim: int, count: int, seed: int) -> Chunks:
-    """What is held at 0 or 1, NaN where a coordinate is free: one or more of each point's, drawn at random."""
+    """Fixed coordinates of boundary points: 0 or 1 for one or more random coordinates of a point, NaN for free ones."""
     rng = np.random.default_rng(seed)
     shares = np.array(HELD[:dim]) / sum(HELD[:dim])
     for size in _sizes(max(count, 1)):
@@ -73,8 +73,10 @@ def crossings(
 
 
 def spread_out(points: Float[np.ndarray, "m d"], count: int, seed: int) -> Float[np.ndarray, "count d"]:
-    """The points that are nearest to the centres of as many clusters, each another one. Where so many points are not
-    different, as those of levels and whole numbers, all that there are, by chance in turn."""
+    """Choose `count` well-spread points: those nearest to the centres of as many clusters, all different.
+
+    If there are no more than `count` distinct points (discrete parameters), all of them, in random order and repeated.
+    """
     distinct = np.unique(points, axis=0)
     if len(distinct) <= count:
         return np.resize(np.random.default_rng(seed).permutation(distinct), (count, points.shape[1]))
@@ -90,6 +92,7 @@ def spread_out(points: Float[np.ndarray, "m d"], count: int, seed: int) -> Float
 
 
 def _sizes(size: int) -> Iterator[int]:
+    """Yield chunk sizes, growing by a factor of 16 up to a limit."""
     while True:
         yield size
         size = max(size, min(16 * size, _LARGEST_CHUNK))

@@ -1,8 +1,8 @@
-"""The lattice on which a search space is screened: a tensor grid in columns along K1, and points of the passive wall.
+"""Lattice on which a search space is screened: a tensor grid in columns along K1, and points of the passivity boundary.
 
-A column of the feasible set ends at the passive wall, x_K1 = x_K1max(B1, alpha); its ends are points of the lattice.
-Where the wall is steep, columns meet it too rarely. There the points are those at which it meets grid lines along B1
-and along alpha: found in a table of the wall by interpolation, then put exactly on the wall.
+A column of the feasible set ends at the passivity boundary, x_K1 = x_K1max(B1, alpha); its ends are lattice points.
+Where that boundary is steep, columns meet it too rarely. There the points are those at which it meets grid lines along
+B1 and along alpha: interpolated in a table of the boundary, then moved exactly onto it.
 """
 
 import functools
@@ -20,7 +20,7 @@ __all__ = ["lattice_of"]
 
 @functools.lru_cache(maxsize=16)
 def lattice_of(space: SearchSpace, nodes: int) -> Lattice:
-    """The lattice of a space, `nodes` per coordinate; without mechanics its columns run along the first parameter."""
+    """Lattice of a space with `nodes` per coordinate; without mechanics its columns run along the first parameter."""
     even, dim = np.linspace(0.0, 1.0, nodes), space.dim
     if space.mechanics is None:
         none = np.zeros((0, nodes ** (dim - 1)))
@@ -36,13 +36,13 @@ def lattice_of(space: SearchSpace, nodes: int) -> Lattice:
 
 
 def _on_device(nodes, inside, ends, present, extra, along, dim) -> Lattice:
-    """The lattice of these arrays, put on the device as they are: `jnp.asarray` would be a program for each shape."""
+    """Lattice of these arrays, transferred to the device without compiling a program for each shape."""
     nodes, inside, ends, present, extra = jax.device_put((nodes, inside, ends, present, extra))
     return Lattice(nodes, inside, ends, present, extra, along, dim)
 
 
 def _steep_wall(space, levels):
-    """Points of the wall at every second of these x_K1, (p, 3), for a space of K1, B1 and alpha alone."""
+    """Points of the passivity boundary at every second of these x_K1, (p, 3), for a space of K1, B1 and alpha only."""
     high, rises = column_table(space.columns)[1], levels[-1:0:-2]
     points = np.ones((0, 3))
     for table, lines, positions, names in (
@@ -60,7 +60,7 @@ def _steep_wall(space, levels):
 
 
 def _ends_of(space, points):
-    """Both ends of the columns of some points; as many at a time as the table has, so that nothing new is compiled."""
+    """Both ends of the columns of points, evaluated in batches of the table's size, so that nothing is recompiled."""
     shape = (len(ROWS), len(COLUMNS), space.dim)
     parts = []
     for begin in range(0, len(points), shape[0] * shape[1]):

@@ -1,5 +1,4 @@
-"""Parameters with steps, whole numbers and unordered levels: which points differ from one by a step, and the steps of
-uniform numbers."""
+"""Discrete parameters (whole numbers and unordered levels): neighbouring points, and rounding of uniform numbers."""
 
 import itertools
 from collections.abc import Iterator
@@ -16,8 +15,11 @@ Parameters = tuple[Parameter, ...]
 
 
 def neighbours(parameters: Parameters, coupled: bool, x: Float[Array, " d"]) -> Float[Array, "k d"]:
-    """Points (k, d) of the unit cube that differ from one in a step of one parameter: whole numbers by 1, 2, 4, ...,
-    levels to every other. Where constraints couple parameters, whole numbers also two at a time, each by 1."""
+    """Points (k, d) of the unit cube that differ from `x` by a step of one discrete parameter.
+
+    Whole numbers change by 1, 2, 4, ..., levels to every other. If constraints are `coupled`, also pairs of whole
+    numbers, each by 1.
+    """
     values = [p.to_physical(x[i]) for i, p in enumerate(parameters)]
     changes = list(_changes(parameters, values))
     whole = [i for i, p in enumerate(parameters) if p.integer]
@@ -34,7 +36,7 @@ def neighbours(parameters: Parameters, coupled: bool, x: Float[Array, " d"]) -> 
 
 
 def _changes(parameters: Parameters, values: list[Float[Array, ""]]) -> Iterator[dict[int, Float[Array, ""]]]:
-    """The parameter's number and its physical value, of every step of one parameter."""
+    """Yield for every step of one parameter its index and new physical value."""
     for i, p in enumerate(parameters):
         if p.levels:
             yield from ({i: (values[i] + step) % p.steps} for step in range(1, p.steps))
@@ -44,11 +46,12 @@ def _changes(parameters: Parameters, values: list[Float[Array, ""]]) -> Iterator
 
 
 def _moved(p: Parameter, value: Float[Array, ""], by: int) -> Float[Array, ""]:
+    """Value changed by `by`, limited to the range."""
     return jnp.clip(value + by, p.low, p.high)
 
 
 def steps_of(parameters: Parameters, uniform: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """Uniform numbers as points of the unit cube: those of whole numbers and levels become steps, each as likely."""
+    """Uniform numbers as points of the unit cube; discrete parameters are rounded to steps of equal probability."""
     if not any(p.discrete for p in parameters):
         return uniform
     x = uniform.copy()

@@ -1,13 +1,13 @@
-"""Covariance of a maximum-likelihood estimate whose answers are correlated within clusters, one way or two.
+"""Cluster-robust covariance of a maximum-likelihood estimate, with one-way or two-way clustering.
 
-With H the information, s_i the scores and s_g their sums over cluster g of G, the covariance by one way is
+With H the information, s_i the scores and s_g their sums over cluster g of G, the one-way covariance is
 
     V = c·H⁻¹ (Σ_g s_g s_gᵀ) H⁻¹,   c = G/(G - 1) · (n - 1)/(n - k)
 
-(Liang & Zeger 1986; c is linear regression's convention for small samples, and makes V unbiased for none), and by two
-ways V_A + V_B - V_AB, AB being the cells in which they cross (Cameron, Gelbach & Miller 2011), each with its own c.
+(Liang & Zeger 1986; c is linear regression's convention for small samples, and makes V unbiased for none), and the
+two-way one V_A + V_B - V_AB, AB being the intersections (Cameron, Gelbach & Miller 2011), each with its own c.
 statsmodels computes them. That difference may be indefinite, which statsmodels leaves as it is; its negative
-eigenvalues are set to 0 here, as the authors propose, and `Covariance.repaired` says how large the worst was. t has
+eigenvalues are set to 0 here, as the authors propose, and `Covariance.repaired` reports how large the worst was. t has
 G - 1 degrees of freedom, G of the smaller way.
 """
 
@@ -23,7 +23,10 @@ _ROUNDING = 1e-12
 
 
 class Covariance(eqx.Module):
-    """A covariance of the estimates; `repaired`: its worst negative eigenvalue over the largest of the one-way sum."""
+    """Covariance of the estimates.
+
+    `repaired`: its worst negative eigenvalue / the largest of the sum of one-way covariances.
+    """
 
     matrix: Float[np.ndarray, "k k"]
     degrees_of_freedom: float
@@ -31,9 +34,9 @@ class Covariance(eqx.Module):
 
 
 def clustered(fitted: Fit, *clusters: Int[np.ndarray, " n"]) -> Covariance:
-    """Cluster-robust covariance by one way or two.
+    """Cluster-robust covariance with one-way or two-way clustering.
 
-    Each way numbers the cluster of every answer, and needs two clusters at least.
+    Each array of `clusters` has the cluster index of every response, and needs two clusters at least.
     """
     from statsmodels.stats.sandwich_covariance import cov_cluster, cov_cluster_2groups
 
@@ -51,7 +54,7 @@ def clustered(fitted: Fit, *clusters: Int[np.ndarray, " n"]) -> Covariance:
 def _repair(
     covariance: Float[np.ndarray, "k k"], one_way_sum: Float[np.ndarray, "k k"]
 ) -> tuple[Float[np.ndarray, "k k"], float]:
-    """The covariance without its negative eigenvalues, and the worst of these over the largest of the one-way sum."""
+    """Covariance with negative eigenvalues set to 0, and the worst relative to the largest of the one-way sum."""
     values, vectors = np.linalg.eigh(covariance)
     if values[0] >= 0:
         return covariance, 0.0

@@ -1,4 +1,4 @@
-"""What callers give to the statistics, as arrays: outcomes, predictors, clusters and levels; checked in one place."""
+"""Validation and conversion of the inputs of the statistics: outcomes, predictors, clusters and confidence levels."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,15 +15,17 @@ Columns = Mapping[str, Any] | pd.DataFrame | pd.Series  # a column for each name
 
 
 def check_level(level: Any) -> None:
-    """Refuse a level of confidence that is none, such as 95: limits of it would be NaN."""
+    """Raise `InputError` for a confidence level that is not between 0 and 1, such as 95."""
     number = isinstance(level, int | float | np.number) and not isinstance(level, bool)
     if not number or not 0 < level < 1:
         raise InputError(f"level is {level!r}; it must be above 0 and below 1, such as 0.95.")
 
 
 def check_aligned(**given: Any) -> None:
-    """Refuse Series and frames whose row labels differ: their rows are taken in the order in which they stand. What has
-    no labels, and mappings of columns, may stand beside them. Raises `InputError`."""
+    """Raise `InputError` for Series and frames whose row labels differ, since rows are matched by position.
+
+    Unlabelled arrays, and mappings of columns, are not checked.
+    """
     labelled = [
         (name, column.index)
         for name, value in given.items()
@@ -39,12 +41,15 @@ def check_aligned(**given: Any) -> None:
 
 
 def is_yes_or_no(values: np.ndarray) -> bool:
-    """Whether there is one entry at least, and each is 0 or 1, yes or no; a missing one is neither."""
+    """Whether the array is not empty and all entries are 0 or 1; a missing value is neither."""
     return bool(values.size and not pd.isna(values).any() and np.isin(values, (0, 1)).all())
 
 
 def predictors_of(given: Columns | None, n: int) -> tuple[list[str], Float[np.ndarray, "n p"]]:
-    """Names and columns (n, p) of the predictors, as finite numbers. Raises `InputError`."""
+    """Names and columns (n, p) of the predictors.
+
+    Raises `InputError` for values that are not finite, and wrong lengths.
+    """
     columns = {name: _numbers(values) for name, values in _columns("predictors", given).items()}
     for name, values in columns.items():
         if values.shape != (n,) or not np.isfinite(values).all():
@@ -53,7 +58,10 @@ def predictors_of(given: Columns | None, n: int) -> tuple[list[str], Float[np.nd
 
 
 def labels_of(given: Columns | None, n: int) -> dict[str, Int[np.ndarray, " n"]]:
-    """The number of every answer's cluster, by each way. Raises `InputError`."""
+    """Cluster index of every response, by clustering variable.
+
+    Raises `InputError` for more than two variables and bad columns.
+    """
     columns = {name: np.asarray(values) for name, values in _columns("clusters", given).items()}
     if len(columns) > 2:
         raise InputError(f"errors can be clustered by one way or two, not by {len(columns)} ({', '.join(columns)}).")
@@ -66,7 +74,7 @@ def labels_of(given: Columns | None, n: int) -> dict[str, Int[np.ndarray, " n"]]
 
 
 def _columns(what: str, given: Columns | None) -> dict[str, Any]:
-    """Columns by name, of a Series by its own. Raises `InputError` for what has no names."""
+    """Columns by name; a Series by its own name. Raises `InputError` for objects without names."""
     if given is None:
         return {}
     if isinstance(given, pd.DataFrame | Mapping):
@@ -79,7 +87,7 @@ def _columns(what: str, given: Columns | None) -> dict[str, Any]:
 
 
 def _numbers(values: Any) -> Float[np.ndarray, "..."]:
-    """As float64; what is no number is one that is not finite."""
+    """Values as float64; NaN if they are not numeric."""
     try:
         return np.asarray(values, float)
     except (TypeError, ValueError):

@@ -1,9 +1,8 @@
-"""Binary and ordered logit of the answers of a validation session, with every kind of error.
+"""Binary and ordered logit of the responses of a validation session, with every kind of standard error.
 
 Binary: P(y = 1) = σ(β0 + x·β). Ordered, categories 0..C-1: P(y <= c) = σ(t_c - x·β), so that a positive coefficient
-shifts answers to higher categories (McCullagh 1980). `hilbo.statistics.regression` says what each kind of error
-assumes, and what a separated coefficient gets. `hilbo.statistics.paper_tables` makes the paper's tables II to IV with
-these.
+shifts responses to higher categories (McCullagh 1980). `hilbo.statistics.regression` documents the assumptions of each
+kind of error, and separated coefficients. `hilbo.statistics.paper_tables` makes the paper's tables II to IV with these.
 """
 
 from collections.abc import Sequence
@@ -119,7 +118,7 @@ def tied_preferences(
 
 
 def _sets_compared(left: np.ndarray, right: np.ndarray, chosen: np.ndarray) -> list[str]:
-    """The names of all sets in comparisons (n,), in the order of the alphabet. Raises `InputError`."""
+    """Names of all sets in the comparisons (n,), sorted. Raises `InputError` for invalid comparisons."""
     if not left.shape == right.shape == chosen.shape == (left.size,):
         raise InputError("first, second and preferred must be lists of one length: an entry each for a comparison.")
     wrong = (chosen != left) & (chosen != right) & (chosen != "tie")
@@ -134,7 +133,7 @@ def _sets_compared(left: np.ndarray, right: np.ndarray, chosen: np.ndarray) -> l
 
 
 def _shown_first(order: Sequence | np.ndarray | None, count: int) -> np.ndarray:
-    """`order` (count,), 0 where nothing is known. Raises `InputError`."""
+    """`order` as an array (count,), 0 if it is None. Raises `InputError` for other values than 1, -1 and 0."""
     shown_first = np.zeros(count) if order is None else np.asarray(order)
     if shown_first.shape != (count,) or pd.isna(shown_first).any() or not np.isin(shown_first, (-1, 0, 1)).all():
         raise InputError("order must hold 1, -1 or 0 for each comparison: first was shown first, second, or unknown.")

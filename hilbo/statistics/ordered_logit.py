@@ -41,19 +41,19 @@ class Design(NamedTuple):
     lower_offset: Float[np.ndarray, " n"]
 
     def edges(self, theta: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Upper and lower edge of every answer."""
+        """Upper and lower edge of every response at `theta`."""
         return self.upper_offset + self.upper @ theta, self.lower_offset + self.lower @ theta
 
     def rows(self, keep: np.ndarray) -> "Design":
-        """Only these answers (mask or indices)."""
+        """Design of the selected responses (mask or indices)."""
         return Design(self.upper[keep], self.lower[keep], self.upper_offset[keep], self.lower_offset[keep])
 
     def columns(self, keep: np.ndarray) -> "Design":
-        """Only these parameters, the others being 0."""
+        """Design of the selected parameters, the others being 0."""
         return Design(self.upper[:, keep], self.lower[:, keep], self.upper_offset, self.lower_offset)
 
     def fixed(self, column: int, value: float) -> "Design":
-        """The design of the other parameters where one of them has this value."""
+        """Design of the other parameters when one of them is fixed at `value`."""
         upper = self.upper_offset + self.upper[:, column] * value
         lower = self.lower_offset + self.lower[:, column] * value
         others = np.arange(self.upper.shape[1]) != column
@@ -61,7 +61,7 @@ class Design(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """The parameters of the largest likelihood, its logarithm, their iid covariance, and each answer's score there."""
+    """Maximum-likelihood estimate, log-likelihood, iid covariance, and score of each response."""
 
     estimate: Float[np.ndarray, " k"]
     log_likelihood: float
@@ -74,10 +74,10 @@ def design(
     predictors: Float[np.ndarray, "n p"],
     edges: Float[np.ndarray, "c m"],
 ) -> Design:
-    """θ = (β, τ): answer i lies between the edges (`edges`·τ)_(c-1) - x_i·β and (`edges`·τ)_c - x_i·β.
+    """Design with θ = (β, τ): response i lies between (`edges`·τ)_(c-1) - x_i·β and (`edges`·τ)_c - x_i·β.
 
-    `category` counts from 0; its largest possible value is the number of edges. The identity as `edges` gives
-    ordered logit, one row without columns binary logit.
+    `category` counts from 0; its largest possible value is the number of edges. The identity as `edges` gives ordered
+    logit, one row without columns binary logit.
     """
     count = len(edges)
     padded = np.vstack([edges, np.zeros((1, edges.shape[1]))])  # the last row serves both open sides
@@ -89,7 +89,7 @@ def design(
 
 
 def log_likelihood(model: Design, theta: Float[np.ndarray, " k"]) -> float:
-    """Sum of log p over the answers; -inf where edges are out of order."""
+    """Log-likelihood: sum of log p over the responses; -inf where edges are out of order."""
     upper, lower = model.edges(theta)
     if np.any(upper <= lower):
         return -np.inf
@@ -97,7 +97,7 @@ def log_likelihood(model: Design, theta: Float[np.ndarray, " k"]) -> float:
 
 
 def scores(model: Design, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n k"]:
-    """Derivative of each answer's log p in the parameters."""
+    """Score of each response: derivative of its log p by the parameters. (n, k)."""
     upper, lower = model.edges(theta)
     inverse = _inverse_gap(upper, lower)
     by_upper, by_lower = expit(-upper) + inverse, -expit(lower) - inverse
@@ -105,7 +105,7 @@ def scores(model: Design, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, "
 
 
 def information(model: Design, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
-    """Minus the second derivative of the sum of log p in the parameters."""
+    """Observed information: minus the second derivative of the log-likelihood. (k, k)."""
     upper, lower = model.edges(theta)
     inverse = _inverse_gap(upper, lower)
     apart = model.upper - model.lower  # where a side is open its weight is 0, so that the row need not be right there
@@ -117,6 +117,7 @@ def information(model: Design, theta: Float[np.ndarray, " k"]) -> Float[np.ndarr
 
 
 def _weighted_square(weights: Float[np.ndarray, " n"], rows: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "k k"]:
+    """Σ_i w_i a_i a_iᵀ over the rows a_i."""
     return (weights * rows.T) @ rows
 
 
@@ -127,11 +128,11 @@ def _inverse_gap(upper: Float[np.ndarray, " n"], lower: Float[np.ndarray, " n"])
 
 
 def fit(model: Design, start: Float[np.ndarray, " k"]) -> Fit:
-    """The largest likelihood, by statsmodels.
+    """Maximise the likelihood, by statsmodels.
 
     `start` must have its edges in order, and a maximum must exist (`hilbo.statistics.separation`) and be unique. The
-    trust region comes first because Newton's full steps alone ended nowhere in 1 of 8 fits of random small tables. Both
-    work in the coordinates of `_orthogonal`. Raises RuntimeError where no maximum is reached.
+    trust region comes first because Newton's full steps alone failed in 1 of 8 fits of random small tables. Both work
+    in the coordinates of `_orthogonal`. Raises RuntimeError if no maximum is found.
     """
     from scipy.linalg import solve_triangular
     from statsmodels.base.model import LikelihoodModel  # a third of a second: who fits nothing does not pay it
@@ -172,9 +173,10 @@ def fit(model: Design, start: Float[np.ndarray, " k"]) -> Fit:
 
 
 def _orthogonal(model: Design) -> tuple[Design, Float[np.ndarray, "k k"]]:
-    """The model in coordinates in which its columns are orthogonal and of one size, and the upper triangular matrix
-    that takes coefficients there: neither the predictors' units nor their origin matter then (days since the year 0,
-    say, beside the constant). Raises RuntimeError where columns depend on each other.
+    """Model in coordinates in which its columns are orthogonal and of equal size, and the matrix of the transformation.
+
+    The upper triangular matrix maps coefficients to these coordinates, which makes the fit independent of the
+    predictors' units and origin (e.g. dates). Raises RuntimeError for linearly dependent columns.
     """
     from scipy.linalg import solve_triangular
 

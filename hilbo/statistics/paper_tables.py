@@ -28,7 +28,7 @@ _OURS, _THEIRS = "Aggregate-Best", "individual"
 
 
 class PaperTables(eqx.Module):
-    """Tables II to IV (None if the table holds no answers of the kind), confusion matrix, and preference rates.
+    """Tables II to IV (None if the data do not allow one), confusion matrix, and preference rates.
 
     `limits`: one sentence for each part that is missing; the tables have their own `warnings`.
     """
@@ -49,11 +49,12 @@ def paper_tables(
     material: str | None = None,
     level: float = 0.95,
 ) -> PaperTables:
-    """Every statistic of the paper's validation sessions, of one material.
+    """Compute all statistics of the paper's validation sessions, for one material.
 
-    `sets` is a sets table (`tables.validation.sets_frame`); its column `role`, if it has one, says which sets are best,
-    mid and worst. Without it the names say so, as plans give them: "best", "foam best", "foam P07 best"; and in table
-    IV "aggregate" and "individual:PARTICIPANT", with or without a material before. Raises `InputError` for a bad table.
+    `sets` is a sets table (`tables.validation.sets_frame`); its column `role`, if it has one, names the best, mid and
+    worst sets. Without it roles are taken from the names, as plans give them: "best", "foam best", "foam P07 best"; and
+    in table IV "aggregate" and "individual:PARTICIPANT", optionally after a material. Raises `InputError` for a bad
+    table.
     """
     check_level(level)
     table = of_material(check_validation(validation, responses), material)
@@ -79,9 +80,9 @@ def paper_tables(
 
 
 def set_sources(table: pd.DataFrame, sets: pd.DataFrame | None) -> tuple[dict[str, str], dict[str, str]]:
-    """Source and role of every set of a validation table; without a sets table their names say both.
+    """Source and role of every set of a validation table; from the set names if there is no sets table.
 
-    Raises `InputError` for a set that the sets table does not have.
+    Raises `InputError` for a set that is missing from the sets table.
     """
     used = sorted({*table["set_a"], *table["set_b"]})
     if sets is None:
@@ -94,6 +95,7 @@ def set_sources(table: pd.DataFrame, sets: pd.DataFrame | None) -> tuple[dict[st
 
 
 def _table_2(answers: pd.DataFrame, responses: Sequence[str], level: float) -> Regression:
+    """Table II: logit of the highest response on whether the set was best."""
     _need(answers, ("best",))
     close = (answers["class"] == responses[-1]).astype(int)
     best = {"Best": (answers["set"] == "best").astype(float)}
@@ -101,6 +103,7 @@ def _table_2(answers: pd.DataFrame, responses: Sequence[str], level: float) -> R
 
 
 def _table_3(answers: pd.DataFrame, responses: Sequence[str], level: float) -> Regression:
+    """Table III: ordered logit of the response class on best and worst."""
     _need(answers, ROLES)
     shifts = {name.capitalize(): (answers["set"] == name).astype(float) for name in ("best", "worst")}
     ranks, names = len(responses) - 1 - answers["category"], list(responses)[::-1]
@@ -108,6 +111,7 @@ def _table_3(answers: pd.DataFrame, responses: Sequence[str], level: float) -> R
 
 
 def _table_4(table: pd.DataFrame, sources: Mapping[str, str], roles: Mapping[str, str], level: float) -> Regression:
+    """Table IV: logit of preferring the aggregate's set to an individual's; with ties by a model for ties."""
     rows = aggregate_comparisons(table, sources, roles)
     if rows.empty:
         raise InputError("no comparison of an aggregate's set with an individual's holds a preference.")

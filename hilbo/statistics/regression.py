@@ -1,14 +1,11 @@
-"""A logit fitted, with every kind of standard error side by side in one tidy table.
+"""Fitted logit with every kind of standard error in one tidy table.
 
-| errors | what they assume |
-|---|---|
-| iid | every answer independent of every other |
-| clustered by A | A's clusters independent, and many; t with G - 1 degrees of freedom |
-| clustered by A and B | answers that share neither independent; t with the smaller G - 1 |
-| profile likelihood | as iid; for a coefficient that has no finite estimate |
+| errors | what they assume | |---|---| | iid | every response independent of every other | | clustered by A | A's
+clusters independent, and many; t with G - 1 degrees of freedom | | clustered by A and B | responses that share neither
+independent; t with the smaller G - 1 | | profile likelihood | as iid; for a coefficient that has no finite estimate |
 
-`docs/methods/statistics.md` says which to trust when, from their coverage in simulated studies. statsmodels fits and
-clusters; the table, its warnings and the separated coefficients are what it does not have.
+`docs/methods/statistics.md` recommends which to use, from their coverage in simulated studies. statsmodels fits and
+clusters; the table, its warnings and the separated coefficients are added here.
 """
 
 from collections.abc import Mapping, Sequence
@@ -54,26 +51,26 @@ class Regression(eqx.Module):
     warnings: tuple[str, ...]
 
     def by(self, errors: str) -> pd.DataFrame:
-        """The rows with one kind of error, indexed by term; coefficients that are not finite stay among them."""
+        """Rows with one kind of error, indexed by term; including the coefficients that are not finite."""
         kinds = [errors, "profile likelihood"]
         return self.table[self.table["errors"].isin(kinds)].set_index("term")
 
 
 class Errors(eqx.Module):
-    """One kind of error: its name, what it assumes, and its covariance."""
+    """One kind of standard error: its name, its assumptions, and the covariance."""
 
     name: str
     assumes: str
     covariance: Covariance
 
     def in_units(self, units: Float[np.ndarray, " k"]) -> "Errors":
-        """The errors of the same coefficients where each column is multiplied by its unit."""
+        """Errors of the coefficients after multiplying each column by its unit."""
         matrix = self.covariance.matrix / np.outer(units, units)
         return eqx.tree_at(lambda errors: errors.covariance.matrix, self, matrix)
 
     @property
     def std_errors(self) -> Float[np.ndarray, " k"]:
-        """Of every coefficient."""
+        """Standard error of every coefficient."""
         return np.sqrt(np.diag(self.covariance.matrix))
 
 
@@ -86,14 +83,14 @@ def regress(
     nuisance: int = 0,
     level: float = 0.95,
 ) -> Regression:
-    """Fit `model` and put every kind of error beside the estimates.
+    """Fit `model` and tabulate the estimates with every kind of standard error.
 
     The last `nuisance` coefficients (edges of categories) get no profile. `start` has its edges in order. Raises
-    `InputError` for coefficients that depend on each other, for more than two ways of clustering, and for a level that
-    is not between 0 and 1.
+    `InputError` for linearly dependent coefficients, for more than two clustering variables, and for a level that is
+    not between 0 and 1.
 
-    Everything is computed in units in which the largest entry of each column is about 1: ranks, linear programs and
-    the repair of covariances compare columns with each other. The units are powers of two, which cost no rounding.
+    Everything is computed in units in which the largest entry of each column is about 1, because ranks, linear programs
+    and the repair of covariances compare columns with each other. The units are powers of two, which cause no rounding.
     """
     check_level(level)
     names, effects = list(terms), len(terms) - nuisance
@@ -125,19 +122,20 @@ def regress(
 
 
 def _in_own_units(model: Design) -> tuple[Design, Float[np.ndarray, " k"]]:
-    """The design with columns whose largest entry is about 1, and the power of two that each was divided by."""
+    """Design with columns scaled to a largest entry of about 1, and the power of two by which each was divided."""
     largest = np.abs(np.vstack([model.upper, model.lower])).max(axis=0)
     units = 2.0 ** np.round(np.log2(np.where(largest > 0, largest, 1.0)))
     return model._replace(upper=model.upper / units, lower=model.lower / units), units
 
 
 def _covariance(kind: Errors, terms: Mapping[int, str]) -> pd.DataFrame:
-    """The covariance of these coefficients, by name."""
+    """Covariance of the named coefficients as a table."""
     shown = list(terms.values())
     return pd.DataFrame(kind.covariance.matrix[np.ix_(list(terms), list(terms))], shown, shown)
 
 
 def _check_independent(model: Design, names: list[str], nuisance: int) -> None:
+    """Raise `InputError` for a column that is a linear combination of the others."""
     order = np.roll(np.arange(len(names)), nuisance)  # edges first: a constant predictor is at fault, not an edge
     good = independent(model.columns(order))
     if not good.all():
@@ -148,7 +146,7 @@ def _check_independent(model: Design, names: list[str], nuisance: int) -> None:
 
 
 def _kinds(fitted: Fit, labels: Mapping[str, Int[np.ndarray, " n"]]) -> tuple[list[Errors], list[str]]:
-    """Every kind of error that these answers allow, iid first, and a sentence for those that they do not."""
+    """All kinds of standard errors that the data allow, iid first, and a sentence for each that they do not allow."""
     kinds = [Errors("iid", "all answers are independent", Covariance(fitted.covariance, np.inf, 0.0))]
     counts = {name: len(np.unique(codes)) for name, codes in labels.items()}
     usable = [name for name, count in counts.items() if count > 1]
@@ -175,7 +173,7 @@ def _kinds(fitted: Fit, labels: Mapping[str, Int[np.ndarray, " n"]]) -> tuple[li
 
 
 def _below_iid(kinds: list[Errors], terms: Mapping[int, str]) -> list[str]:
-    """A sentence for each kind of clustered error that is smaller than the iid error of some coefficient."""
+    """A warning for each kind of clustered error that is smaller than the iid error of some coefficient."""
     reference, sentences = kinds[0].std_errors, []
     for kind in kinds[1:]:
         errors = kind.std_errors
@@ -192,7 +190,7 @@ def _below_iid(kinds: list[Errors], terms: Mapping[int, str]) -> list[str]:
 def _wald(
     term: str, estimate: float, j: int, kind: Errors, iid_errors: Float[np.ndarray, " k"], level: float
 ) -> dict[str, Any]:
-    """The row of coefficient j with one kind of error, by t (normal for iid)."""
+    """Table row of coefficient j with one kind of error, by t (normal for iid)."""
     error, dof = float(kind.std_errors[j]), kind.covariance.degrees_of_freedom
     if error <= _NO_SPREAD * iid_errors[j]:
         return _row(term, estimate, kind.name, f"{kind.assumes}; {_NOTHING_LEFT}", degrees_of_freedom=dof)
@@ -207,7 +205,7 @@ def _wald(
 def _profiled(
     model: Design, j: int, term: str, start: np.ndarray, separated: Separation, level: float | None, unit: float
 ) -> dict[str, Any]:
-    """The row of a coefficient without a finite estimate; without a level no interval. `unit`: of its column."""
+    """Table row of a coefficient without a finite estimate; no interval if `level` is None. `unit`: of its column."""
     low, high, p_value = (np.nan,) * 3 if level is None else profile(model, j, start, separated, level)
     both = separated.rises[j] and separated.falls[j]
     estimate = np.nan if both else np.inf if separated.rises[j] else -np.inf
@@ -216,6 +214,7 @@ def _profiled(
 
 
 def _separated_sentence(names: list[str], separated: Separation, effects: int) -> str:
+    """Warning that names the separated coefficients."""
     infinite = [name for name, without in zip(names, separated.infinite, strict=True) if without]
     shown = [name for name in infinite if name in names[:effects]] or infinite
     return (
@@ -226,7 +225,7 @@ def _separated_sentence(names: list[str], separated: Separation, effects: int) -
 
 
 def _row(term: str, estimate: float, errors: str, assumes: str, **numbers: float) -> dict[str, Any]:
-    """A row of the table, in its columns' order; what is not given is missing."""
+    """Row of the table in the order of its columns; missing values are NaN."""
     columns = ("std_error", "statistic", "degrees_of_freedom", "p_value", "low", "high")
     row = {"term": str(term), "estimate": float(estimate), "errors": errors}
     row |= dict.fromkeys(columns, np.nan) | numbers
@@ -236,7 +235,7 @@ def _row(term: str, estimate: float, errors: str, assumes: str, **numbers: float
 
 
 def _tidy(rows: list[dict[str, Any]], names: list[str], effects: int) -> pd.DataFrame:
-    """The rows in the order of their terms; edges of categories have no odds ratio."""
+    """Table of the rows in the order of their terms; edges of categories get no odds ratio."""
     table = pd.DataFrame(rows)
     table.loc[table["term"].isin(names[effects:]), ["odds_ratio", "odds_low", "odds_high"]] = np.nan
     order = {name: place for place, name in enumerate(names)}

@@ -24,10 +24,10 @@ _TOLERANCE = 1e-7  # of a direction with entries up to 1; the solver's feasibili
 
 
 class Separation(eqx.Module):
-    """What is not finite.
+    """Coefficients without a finite estimate.
 
     `falls`, `rises`: whether a coefficient goes to -inf, to inf, along some direction that never lowers the likelihood
-    (both: the answers say nothing of its sign). `upper`, `lower`: edges that go to infinity or are there already.
+    (both: its sign is undetermined). `upper`, `lower`: edges that are infinite or go to infinity.
     """
 
     falls: Bool[np.ndarray, " k"]
@@ -37,17 +37,17 @@ class Separation(eqx.Module):
 
     @property
     def infinite(self) -> Bool[np.ndarray, " k"]:
-        """Coefficients without a finite estimate."""
+        """Mask of the coefficients without a finite estimate."""
         return self.falls | self.rises
 
     @property
     def certain(self) -> Bool[np.ndarray, " n"]:
-        """Answers whose probability goes to 1."""
+        """Mask of the responses whose fitted probability goes to 1."""
         return self.upper & self.lower
 
 
 def separation(model: Design) -> Separation:
-    """Find every coefficient without a finite estimate, and the edges that go with them."""
+    """Find every coefficient without a finite estimate, and the edges that go to infinity."""
     rows, k = _constraints(model), model.upper.shape[1]
     upper, lower = np.isinf(model.upper_offset), np.isinf(model.lower_offset)
     rises, falls = np.zeros(k, bool), np.zeros(k, bool)
@@ -57,13 +57,13 @@ def separation(model: Design) -> Separation:
         above, below = np.split(moves[inverse.ravel()], [np.sum(~upper)])
         upper[~upper], lower[~lower] = above, below
         if moves.any():
-            rises = np.array([_reach(distinct, j, 1) > _TOLERANCE for j in range(k)])
-            falls = np.array([_reach(distinct, j, -1) > _TOLERANCE for j in range(k)])
+            rises = np.array([_largest_change(distinct, j, 1) > _TOLERANCE for j in range(k)])
+            falls = np.array([_largest_change(distinct, j, -1) > _TOLERANCE for j in range(k)])
     return Separation(falls, rises, upper, lower)
 
 
 def independent(model: Design) -> Bool[np.ndarray, " k"]:
-    """Columns that are no combination of those before them, of the edges that are not open."""
+    """Mask of the columns that are linearly independent of those before them, over the finite edges."""
     rows = _constraints(model)
     keep = np.zeros(model.upper.shape[1], bool)
     rank = 0
@@ -75,7 +75,7 @@ def independent(model: Design) -> Bool[np.ndarray, " k"]:
 
 
 def supremum(model: Design, start: Float[np.ndarray, " k"], separated: Separation) -> float:
-    """The supremum of the log-likelihood, reached or not."""
+    """Supremum of the log-likelihood, attained or not."""
     if separated.certain.all():
         return 0.0
     rest, _, rest_start = decisive(model, start, separated)
@@ -87,10 +87,10 @@ def supremum(model: Design, start: Float[np.ndarray, " k"], separated: Separatio
 def decisive(
     model: Design, start: Float[np.ndarray, " k"], separated: Separation
 ) -> tuple[Design, Bool[np.ndarray, " k"], Float[np.ndarray, " j"]]:
-    """The answers that are not certain, with as many coefficients as they decide, which these are, and a start.
+    """Design of the responses that are not certain, mask of the coefficients that they determine, and a start.
 
-    Edges that go to infinity are open. A coefficient that is left out is 0 there: the edges that are left depend on it
-    through the others only.
+    Edges that go to infinity are open. A coefficient that is left out is 0: the remaining edges depend on it only
+    through the others.
     """
     rest = Design(
         np.where(separated.upper[:, None], 0.0, model.upper),
@@ -136,13 +136,13 @@ def profile(
 
 
 def _constraints(model: Design) -> Float[np.ndarray, "r k"]:
-    """Rows a with a·δ >= 0 for every direction along which nothing is lost: upper edges, then lower ones."""
+    """Rows a with a·δ >= 0 for every direction δ that does not lower the likelihood: upper edges, then lower ones."""
     has_upper, has_lower = np.isfinite(model.upper_offset), np.isfinite(model.lower_offset)
     return np.vstack([model.upper[has_upper], -model.lower[has_lower]])
 
 
 def _largest_support(rows: Float[np.ndarray, "r k"]) -> Bool[np.ndarray, " r"]:
-    """Which rows some feasible direction moves: maximise Σ min(a·δ, 1); sums of directions are directions."""
+    """Mask of the rows that some feasible direction moves: maximise Σ min(a·δ, 1)."""
     count, k = rows.shape
     cost = np.concatenate([np.zeros(k), -np.ones(count)])
     bounds = [(None, None)] * k + [(0, 1)] * count
@@ -150,8 +150,8 @@ def _largest_support(rows: Float[np.ndarray, "r k"]) -> Bool[np.ndarray, " r"]:
     return direction_and_moves[k:] > 0.5
 
 
-def _reach(rows: Float[np.ndarray, "r k"], column: int, sign: int) -> float:
-    """How far a direction in the unit cube that loses nothing can move a coefficient."""
+def _largest_change(rows: Float[np.ndarray, "r k"], column: int, sign: int) -> float:
+    """Largest change of a coefficient, in direction `sign`, along a feasible direction in the unit cube."""
     cost = np.zeros(rows.shape[1])
     cost[column] = -sign
     return -linprog(cost, A_ub=-rows, b_ub=np.zeros(len(rows)), bounds=(-1, 1)).fun
