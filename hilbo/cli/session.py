@@ -154,8 +154,6 @@ def _say_done(done) -> None:
         typer.echo(f"{path}: {count} removed", err=True)
     for path, count in done.renamed.items():
         typer.echo(f"{path}: {count} of what others have stays, under the name {done.label}", err=True)
-    for path in done.marked:
-        typer.echo(f"{path}: says that the results beside it were made before", err=True)
     for path, why in done.left.items():
         typer.echo(f"{path}: LEFT; {why}", err=True)
     for command in done.commands:

@@ -9,23 +9,21 @@ import pandas as pd
 import pytest
 from commands import run
 from live import STUDY, Driver
+from withdrawn_study import SETS, older_log
 
 from hilbo.cli.terminal.console import results
 from hilbo.errors import InputError
 from hilbo.session.log.event_log import EventLog
-from hilbo.session.log.log_files import log_name
 from hilbo.session.log.records import Block, Header, Planned
 from hilbo.session.plan.participants import read_people
 from hilbo.session.plan.plan import make_plan, plan_hash, planned_header, reissue
 from hilbo.session.withdrawal import withdrawal
-from hilbo.session.withdrawal.results import command_without
+from hilbo.session.withdrawal.changes import command_without
 from hilbo.session.withdrawal.withdrawal import delete_participant
 from hilbo.study.cohort import read_trials
 from hilbo.study.disk.lock import locked_folder
 from hilbo.study.results.listing import list_files, listed
 from hilbo.study.tables.validation import read_validation, sets_frame
-
-SETS = {"best": {"u": 0.5, "v": 0.5}, "own-P02": {"u": 0.1, "v": 0.5}, "own-P01": {"u": 0.2, "v": 0.5}}
 
 
 @pytest.fixture
@@ -116,18 +114,17 @@ def results_of(monkeypatch, folder, people, *command):
         (made / "map.png").write_bytes(b"\x89PNG")
 
 
-def test_results_with_them_go_and_those_that_may_hold_them_are_marked(folder, capsys, monkeypatch):
+def test_results_with_them_go_and_those_that_may_hold_them_and_are_made_again(folder, capsys, monkeypatch):
     results_of(monkeypatch, folder / "map", ["P01", "P02"], "aggregate", "trials.csv", "--participants", "P01,P02")
     results_of(monkeypatch, folder / "others", ["P01", "P03"], "aggregate", "trials.csv")
     results_of(monkeypatch, folder / "compared", [], "validate", "validation.csv", "--study", "study.toml")
     err = delete(capsys, monkeypatch, folder, "P02")
     assert not (folder / "map").exists() and (folder / "others" / "map.png").exists()
     assert "make again: " in err and "hilbo aggregate trials.csv --participants P01\n" in err
-    mark = folder / "compared" / "MADE-BEFORE-A-WITHDRAWAL.txt"
-    assert "hilbo validate validation.csv" in mark.read_text() and f"{mark}: " in err
+    assert not (folder / "compared").exists() and "hilbo validate validation.csv --study study.toml\n" in err
 
 
-def test_of_two_results_side_by_side_one_goes(folder, capsys, monkeypatch):
+def test_tables_among_results_stay_and_are_reported_again(folder, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["hilbo", "demo"])
     with results(folder / "demo", force=False) as made:
         for name, person in (("videos", "V01"), ("foam", "P02")):
@@ -136,9 +133,10 @@ def test_of_two_results_side_by_side_one_goes(folder, capsys, monkeypatch):
             (made / name / "trials.csv").write_text(f"participant,trial\n{person},1\nX1,1\n")
             (made / name / "study.toml").write_text("")
     err = delete(capsys, monkeypatch, folder, "P02")
-    assert (folder / "demo" / "videos" / "result.json").exists()
-    assert sorted(path.name for path in (folder / "demo" / "foam").iterdir()) == ["study.toml", "trials.csv"]
-    assert f"make again: hilbo report {folder / 'demo' / 'foam'} --out " in err
+    for name in ("videos", "foam"):
+        assert sorted(path.name for path in (folder / "demo" / name).iterdir()) == ["study.toml", "trials.csv"]
+        assert f"make again: hilbo report {folder / 'demo' / name} --out " in err
+    assert (folder / "demo" / "videos" / "trials.csv").read_text().count("V01") == 1
 
 
 def test_an_exported_folder_can_be_replaced_afterwards(folder, capsys, monkeypatch):
@@ -150,22 +148,6 @@ def test_an_exported_folder_can_be_replaced_afterwards(folder, capsys, monkeypat
     assert (folder / "tables" / "t_data.csv").read_text() == "participant,trial\nP01,1\n"
     with results(folder / "tables", force=True) as made:
         (made / "new.csv").write_text("")
-
-
-def older_log(folder, person):
-    """The log of somebody who compared a set that is called after P02."""
-    block = Block("aggregate-best", 1, (Planned("aggregate", "individual:P02"),))
-    sets = {"aggregate": SETS["best"], "individual:P02": SETS["own-P02"]}
-    header = Header(study=STUDY.file.hash, participant=person, session="3", seed=0, blocks=(block,), sets=sets)
-    driver = Driver()
-    driver.header, driver.state = header, type(driver.state).start(STUDY.file, header)
-    driver.values = lambda trial, number: {"preferred": "a"}
-    driver.step()
-    driver.finish()
-    with EventLog.create(folder / log_name(header), STUDY.file, header) as log:
-        for event in driver.events:
-            log.append(event)
-    return folder / log_name(header)
 
 
 def test_keys_of_their_sessions_go_and_those_of_longer_ids_stay(folder):
@@ -182,6 +164,8 @@ def test_keys_of_their_sessions_go_and_those_of_longer_ids_stay(folder):
 
 def test_logs_of_others_are_listed_and_stay_as_they_are(folder, capsys, monkeypatch):
     theirs, others = older_log(folder, "P02"), older_log(folder, "P03")
+    (folder / "P02_3.0000.rescued.jsonl").write_bytes(theirs.read_bytes())
+    (folder / "copy of a log").write_bytes(theirs.read_bytes())
     content = others.read_bytes()
     (folder / "P09_1.session.jsonl").write_bytes(b"damaged\n")
     (folder / "map.nc").write_bytes(b"damaged")
@@ -189,6 +173,7 @@ def test_logs_of_others_are_listed_and_stay_as_they_are(folder, capsys, monkeypa
     (folder / "letter.txt").write_text("P02 would like to know.")
     (folder / "other.txt").write_text("P020 and xP02 and P02-b are other people.")
     err = delete(capsys, monkeypatch, folder, "P02")
+    assert not list(folder.glob("*P02_3*")) and not (folder / "copy of a log").exists()
     assert not theirs.exists() and others.read_bytes() == content
     listed = {line.split(": ")[0] for line in err.splitlines() if ": LEFT; " in line}
     damaged = {"P09_1.session.jsonl", "map.nc", "trials-2.parquet"}
@@ -255,22 +240,20 @@ def test_coded_sets_that_their_rows_alone_name_go(tmp_path):
     assert "under codes" in done.left[str(tmp_path)] and str(tmp_path / "sets.csv") in done.left[str(tmp_path)]
 
 
-def test_marked_results_can_be_made_again_by_the_command_that_is_printed(folder, monkeypatch):
-    compared = folder / "compared"
-    results_of(monkeypatch, compared, [], "validate", "validation.csv")
-    done = delete_participant(folder, "P02")
-    (command,) = done.commands
-    assert command.endswith("hilbo validate validation.csv --force") and command in Path(done.marked[0]).read_text()
-    with results(compared, force=True) as made:
-        (made / "result.json").write_text("{}")
-    assert not (compared / "MADE-BEFORE-A-WITHDRAWAL.txt").exists()
+def test_what_somebody_put_among_results_stays_and_they_are_made_again_over_it(folder, monkeypatch):
+    results_of(monkeypatch, folder / "compared", [], "validate", "validation.csv")
+    (folder / "compared" / "notes.txt").write_text("mine")
+    (command,) = delete_participant(folder, "P02").commands
+    assert command.endswith("hilbo validate validation.csv --force")
+    assert [path.name for path in (folder / "compared").iterdir()] == ["notes.txt"]
 
 
-def test_results_without_a_command_are_marked(folder, capsys, monkeypatch):
+def test_results_without_a_command_go(folder, capsys, monkeypatch):
     (folder / "older").mkdir()
     (folder / "older" / "result.json").write_text("{}")
     list_files(folder / "older")
-    assert delete_participant(folder, "P02").marked == [str(folder / "older" / "MADE-BEFORE-A-WITHDRAWAL.txt")]
+    assert delete_participant(folder, "P02").commands == [f"{folder / 'older'}: by the hilbo command that made it"]
+    assert not (folder / "older").exists()
 
 
 COMMANDS = {
@@ -286,9 +269,11 @@ COMMANDS = {
 def test_a_command_is_written_back_without_them(folder, monkeypatch, command):
     assert command_without(command, "P02") == COMMANDS[command]
     assert command_without("hilbo power --participants 6,12 --trials 12", "12").count("12") == 2
-    results_of(monkeypatch, folder / "compared", [], *command.replace("aggregate", "validate").split()[1:])
+    monkeypatch.setattr("sys.argv", command.split())
+    with results(folder / "tables", force=False) as made:
+        (made / "trials.csv").write_text("participant,trial\nP01,1\nP02,1\n")
     delete_participant(folder, "P02")
-    assert listed(folder / "compared").command == COMMANDS[command].replace("aggregate", "validate")
+    assert listed(folder / "tables").command == COMMANDS[command]
 
 
 def test_figures_in_folders_below_a_result_go_with_it(folder, monkeypatch):
@@ -300,8 +285,7 @@ def test_figures_in_folders_below_a_result_go_with_it(folder, monkeypatch):
             (made / name / "figures" / "map.png").write_bytes(b"\x89PNG")
         (made / "comparison.json").write_text("{}")
     delete_participant(folder, "P02")
-    left = sorted(path.name for path in (folder / "demo").rglob("*") if path.is_file())
-    assert left == [".hilbo.json", "map.png", "result.json"]
+    assert not (folder / "demo").exists()
 
 
 def test_results_that_hold_a_number_do_not_name_somebody(folder, monkeypatch):
@@ -342,7 +326,7 @@ def test_a_number_is_an_id_where_ids_stand_alone(tmp_path):
 def test_a_list_that_somebody_is_added_to_is_waited_for(tmp_path, monkeypatch):
     path = tmp_path / "participants.csv"  # made by hand: nobody was added to it by hilbo
     path.write_text("participant,consent_time,protocol_number\nP01,2026-01-05,1\nP02,2026-01-05,1\n")
-    monkeypatch.setattr(withdrawal, "locked_folder", lambda folder: locked_folder(folder, 0.05))
+    monkeypatch.setattr(withdrawal, "_PATIENCE", 0.05)
     with locked_folder(tmp_path), pytest.raises(InputError, match="is being changed by another hilbo"):
         delete_participant(tmp_path, "P01")
     assert set(read_people(path)) == {"P01", "P02"}

@@ -13,7 +13,8 @@ from commands import run
 
 from hilbo.errors import InputError
 from hilbo.session.withdrawal import withdrawal
-from hilbo.session.withdrawal.withdrawal import delete_participant
+from hilbo.session.withdrawal.withdrawal import Withdrawal, delete_participant
+from hilbo.study.disk.lock import JOURNAL
 from hilbo.study.results.listing import list_files
 
 TABLE = "participant,trial\nP01,1\nP02,1\n"
@@ -107,10 +108,11 @@ def test_packed_files_are_known_by_how_they_begin(study):
 
 
 def test_a_folder_of_results_of_which_nothing_is_left_goes(tmp_path):
-    (tmp_path / "map").mkdir()
-    (tmp_path / "map" / "result.json").write_text('{"participants": [{"participant": "P01"}]}')
-    list_files(tmp_path / "map", "hilbo aggregate trials.csv")
-    assert delete_participant(tmp_path / "map", "P01").commands and not (tmp_path / "map").exists()
+    (tmp_path / "maps" / "map" / "figures").mkdir(parents=True)
+    (tmp_path / "maps" / "map" / "result.json").write_text('{"participants": [{"participant": "P01"}]}')
+    (tmp_path / "maps" / "map" / "figures" / "map.svg").write_text("")
+    list_files(tmp_path / "maps" / "map", "hilbo aggregate trials.csv")
+    assert delete_participant(tmp_path / "maps", "P01").commands and not list((tmp_path / "maps").iterdir())
 
 
 def test_where_nothing_is_found_what_was_not_searched_is_named(study, capsys, monkeypatch):
@@ -154,18 +156,27 @@ def test_what_cannot_be_changed_is_listed_and_the_rest_is_done(study, monkeypatc
     refusing(monkeypatch, Path, "unlink", ".P01-1.keys")
     refusing(monkeypatch, Path, "unlink", "report.html")
     refusing(monkeypatch, os, "replace", "fixed.csv")
-    done = delete_participant(study, "P01")
+    done = Withdrawal("P01")
+    with pytest.raises(InputError, match=r"could not be changed \(3 in all\); mend that and give the command again"):
+        delete_participant(study, "P01", done)
     assert set(done.removed) == {str(study / name) for name in ("trials.csv", "map/result.json")} and done.commands
     assert set(done.left) == {str(study / name) for name in (".P01-1.keys", "fixed.csv", "map/report.html")}
     assert all("could not be changed (Permission denied)" in why for why in done.left.values())
     assert (study / "fixed.csv").read_text() == TABLE
-    assert sorted(path.name for path in study.iterdir()) == [".P01-1.keys", "fixed.csv", "map", "trials.csv"]
+    assert sorted(path.name for path in study.iterdir()) == [".P01-1.keys", JOURNAL, "fixed.csv", "map", "trials.csv"]
+    monkeypatch.undo()
+    again = delete_participant(study, "P01")
+    assert set(again.removed) == {*done.removed, *done.left} and not again.left and again.commands == done.commands
+    assert sorted(path.name for path in study.iterdir()) == ["fixed.csv", "trials.csv"]
 
 
 def test_a_withdrawal_that_an_error_ends_says_what_it_did(study, capsys, monkeypatch):
     def broken(*_):
         raise RuntimeError("of a library")
 
-    monkeypatch.setattr(withdrawal, "_plans", broken)
+    monkeypatch.setattr(withdrawal, "list_again", broken)
+    (study / "map").mkdir()
+    (study / "map" / "result.json").write_text('{"participants": [{"participant": "P01"}]}')
+    list_files(study / "map", "hilbo aggregate trials.csv")
     code, _, err = run(capsys, monkeypatch, "participants", "delete", study, "P01", "--yes")
     assert code == 1 and f"{study / 'trials.csv'}: 1 removed\n" in err and "of a library" in err

@@ -1,168 +1,223 @@
-"""Somebody withdraws from a study: what of theirs goes, what becomes nobody's, what must be made again, what stays.
+"""Somebody withdraws from a study: what of theirs goes, what gets a pseudonym, what is made again, what is left.
 
-`delete_participant` does it to everything below a folder and says all of it. What it does not touch: a log of somebody
-else, which is chained and theirs, even where it names a set of the one who withdraws; files that are not hilbo's. Both
-are listed. The study goes on: every command still runs on what is left.
+`delete_participant` holds the lock of the folder from the first look to the last change. What is to be done is decided
+before anything is changed and stands in a journal, which is deleted last: a withdrawal that was killed is given again
+and ends as an unbroken one would, with the same pseudonym and the same sentences. Until then no other command changes
+anything below the folder. What is not touched is listed: a log of somebody else, which is chained and theirs, even
+where it names a set of the one who withdraws; files that are not hilbo's; ids that are spelled otherwise.
 """
 
 import contextlib
+import errno
+import fnmatch
 import os
 import secrets
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
+
 from hilbo.errors import InputError
-from hilbo.session.log.event_log import read_log
 from hilbo.session.log.log_files import in_use, keys_path
-from hilbo.session.withdrawal.files import Below, files_below, is_closed, refusals, remove
-from hilbo.session.withdrawal.names import CODED_JUDGED, CODED_OWN, file_is_called_after, file_names
-from hilbo.session.withdrawal.results import clear_results, plan_without, results_folders
-from hilbo.session.withdrawal.tables import (
+from hilbo.session.withdrawal.changes import (
     Cells,
-    coded_own,
-    named_sets,
-    netcdf_without,
+    is_plan,
+    plan_without,
     read_table,
-    set_names,
-    sets_compared,
-    sets_from,
+    sets_of,
+    table_content,
     without_person,
-    write_table,
 )
-from hilbo.study.disk.lock import locked_folder
-from hilbo.study.results.listing import LIST, listed, relist
+from hilbo.session.withdrawal.left import ending, left_below, logs
+from hilbo.session.withdrawal.results import commands_of, computed, list_again, results_folders
+from hilbo.session.withdrawal.traces import Below, files_below
+from hilbo.study.disk.lock import JOURNAL, locked_folder, withdrawal_above
+from hilbo.study.disk.new_file import UNFINISHED, remove_unfinished, rewrite_file, write_file
+from hilbo.study.disk.new_folder import LEFTOVER, recover
+from hilbo.study.results.listing import LIST
 
 __all__ = ["Withdrawal", "delete_participant"]
 
+_PATIENCE = 60.0  # s; of a withdrawal that waits for another
 _OPTIONAL = ("trials", "validation", "sets", "truth")  # a report takes none of these rather than one without rows
-_UNREADABLE = "cannot be read; if it holds their answers, delete it"
 _HEAD = 2**12  # bytes of a table's first line
-_PICTURES = (".png", ".jpg", ".jpeg", ".gif")
 
 
-@dataclass
-class Withdrawal:
-    """What a withdrawal did, and what it left."""
+class Withdrawal(msgspec.Struct):
+    """What a withdrawal does, and what it leaves; files by their path from the folder's own."""
 
     participant: str
-    label: str = field(default_factory=lambda: f"withdrawn-{secrets.token_hex(3)}")
-    """What stands in the place of the id where something of theirs stays as nobody's."""
-    removed: dict[str, int] = field(default_factory=dict)
-    """File -> rows that went, or 1 for the whole file."""
-    renamed: dict[str, int] = field(default_factory=dict)
-    """File -> rows, or 1 for a plan, in which the label stands now."""
-    marked: list[str] = field(default_factory=list)
-    """Files that say of the results beside them that they were made before."""
-    commands: list[str] = field(default_factory=list)
-    """What makes again the results that went or are marked."""
-    left: dict[str, str] = field(default_factory=dict)
+    label: str = msgspec.field(default_factory=lambda: f"withdrawn-{secrets.token_hex(3)}")
+    """The pseudonym that stands in the place of the id where something of theirs stays."""
+    removed: dict[str, int] = {}
+    """File -> rows that go, or 1 for the whole file."""
+    renamed: dict[str, int] = {}
+    """File -> rows, or 1 for a plan, in which the pseudonym stands now."""
+    commands: list[str] = []
+    """What makes again the results that go."""
+    left: dict[str, str] = {}
     """File that still names them, or may -> why it stays."""
+    files: list[str] = []
+    """Those that go as a whole,"""
+    results: list[str] = []
+    """and the results folders that they are in."""
+    sets: dict[str, str] = {}
+    """Names of their sets -> what they are called now,"""
+    sets_gone: list[str] = []
+    """and the sets that nobody else has compared."""
+
+    @property
+    def begun(self) -> bool:
+        """Whether anything may have been changed."""
+        return bool(self.files or self.removed or self.renamed)
 
 
 def delete_participant(folder: str | os.PathLike, participant: str, done: Withdrawal | None = None) -> Withdrawal:
-    """Remove one participant from everything below a folder. Raises InputError if nothing of theirs is there, or one of
-    their sessions is running.
+    """Remove one participant from everything below a folder. Raises InputError if nothing of theirs is there, one of
+    their sessions is running, results are being made, or a file could not be changed: all else is done then, and the
+    command is to be given again.
 
     `done` is filled on the way, so that who gave it can say what was done if something unforeseen ends it."""
+    root, done = Path(folder), Withdrawal(participant) if done is None else done
     if not participant.strip():
         raise InputError("participants delete: give the id of the participant.")
-    root = Path(folder)
-    done = Withdrawal(participant) if done is None else done
-    below = _below(root)
-    whose, damaged = _logs(below.files)
-    theirs = [path for path, person in whose.items() if person == participant]
-    for path in theirs:
-        if in_use(path):
-            raise InputError(f"{path}: is being written; end the session first.")
-    done.left |= below.left
-    with _alone_with_lists(below.files):
-        _remove([*theirs, *_keys(below.files, participant, whose)], done)
-        _results(below.files, done)
-        _tables(below, done)
-        _plans(below.files, done)
-        _lists(below, done)
-    after = files_below(root) if root.exists() else Below([], {}, {})  # results, of which nothing is left
-    done.left |= after.left | _left(after.files, participant, whose, damaged) | done.left
-    if not (done.removed or done.renamed):
-        also = f"; look at what is LEFT ({', '.join([*done.left][:3])})" if done.left else ""
-        raise InputError(f'{folder}: nothing of participant "{participant}" was removed{also}; check id and folder.')
-    if coded := _coded(after.files):
-        done.left[str(root)] = (
-            f"{len(coded)} files below hold renderings from individuals' maps under codes, theirs perhaps among them;"
-            f" the values stay with those who compared them: {', '.join(map(str, coded))}"
-        )
+    if not root.is_dir():
+        raise InputError(f"{root}: cannot be opened (no such folder); give the folder that holds everything.")
+    with locked_folder(root, _PATIENCE, in_withdrawal=True), contextlib.ExitStack() as locks:
+        before = _journal(root, participant)
+        done.label = before.label
+        try:
+            _wait_for_others(root, locks)
+            planned = _planned(root, before)
+            if not (planned.files or planned.removed or planned.renamed):
+                done.left = left_below(root, participant)
+                also = f"; look at what is LEFT ({', '.join([*done.left][:3])})" if done.left else ""
+                raise InputError(
+                    f'{root}: nothing of participant "{participant}" was removed{also}; check id and folder.'
+                )
+        except BaseException:
+            if not before.begun:
+                (root / JOURNAL).unlink()
+            raise
+        _write_journal(root, planned)
+        refused = _carry_out(root, planned, done)
+        done.left |= left_below(root, participant) | refused
+        if refused:
+            raise InputError(
+                f"{next(iter(refused))}: could not be changed ({len(refused)} in all); mend that and give the command"
+                f" again, or delete {root / JOURNAL} to leave it so. Until then nothing else is changed here."
+            )
+        (root / JOURNAL).unlink()
     return done
 
 
-@contextlib.contextmanager
-def _alone_with_lists(files: Iterable[Path]) -> Iterator[None]:
-    """Nobody is added to a list of participants meanwhile, who would be lost when it is written anew. Raises InputError
-    before anything is removed if another hilbo is not done with one."""
-    places = sorted({path.resolve().parent for path in _ending(files, ".csv") if _is_list_of_people(path)})
-    with contextlib.ExitStack() as locks:
-        for place in places:
-            locks.enter_context(locked_folder(place))
-        yield
+# Alone with the folder.
 
 
-def _is_list_of_people(path: Path) -> bool:
-    with open(path, "rb") as file:
-        return b"consent_time" in file.readline(_HEAD)
+def _journal(root: Path, participant: str) -> Withdrawal:
+    """That of a withdrawal that was interrupted, or a new one."""
+    path = root / JOURNAL
+    if above := withdrawal_above(Path(os.path.realpath(root)).parent):
+        raise InputError(f"{above}: a withdrawal was interrupted there; give its command again first.")
+    try:
+        before = msgspec.json.decode(path.read_bytes(), type=Withdrawal)
+    except FileNotFoundError:
+        before = Withdrawal(participant)
+        _write_journal(root, before)
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: is no journal of a withdrawal that can be read ({error}); delete it.") from error
+    if before.participant != participant:
+        raise InputError(
+            f"{root}: the withdrawal of another participant was interrupted here; first give its command again: hilbo"
+            f" participants delete {root} {before.participant} --yes."
+        )
+    return before
 
 
-def _below(root: Path) -> Below:
-    below = files_below(root)
-    if str(root) in below.left:
-        raise InputError(f"{root}: {below.left[str(root)].partition(';')[0]}; give the folder that holds everything.")
-    return below
+def _write_journal(root: Path, content: Withdrawal) -> None:
+    try:
+        write_file(root / JOURNAL, msgspec.json.encode(content), replace=True)
+    except OSError as error:
+        raise InputError(f"{root / JOURNAL}: cannot be written ({error.strerror}); nothing was changed.") from error
 
 
-def _results(files: list[Path], done: Withdrawal) -> None:
-    """What was computed from their answers goes, or is marked."""
-    for folder in results_folders(files):
-        cleared = clear_results(folder, done.participant, files)
-        done.removed |= dict.fromkeys(map(str, cleared.removed), 1)
-        done.marked += map(str, cleared.marked)
-        done.commands += cleared.commands
-        done.left |= cleared.left
+def _wait_for_others(root: Path, locks: contextlib.ExitStack) -> None:
+    """Hold the locks of the folders below that others may be changing, and deal with what killed commands left there.
+    Raises InputError."""
+    inside, leftovers, places = Path(os.path.realpath(root)), [root], set()
+    for place, folders, names in os.walk(root):
+        if Path(place) != root and JOURNAL in names:
+            raise InputError(f"{place}: a withdrawal was interrupted there; give its command again first.")
+        kept = [name for name in folders if not LEFTOVER.fullmatch(name)]
+        if kept != folders or fnmatch.filter(names, UNFINISHED):
+            leftovers.append(Path(place))
+        shared = (os.path.realpath(Path(place, name)) for name in names if _is_shared(Path(place, name)))
+        places |= {Path(path).parent for path in shared if Path(path).is_relative_to(inside)}
+        folders[:] = kept
+    places |= {Path(os.path.realpath(place)) for place in leftovers}
+    for place in sorted(places - {inside}):
+        locks.enter_context(locked_folder(place, in_withdrawal=True))
+    for place in leftovers:
+        remove_unfinished(place)
+        if filled := recover(place):
+            raise InputError(f"{filled[0]}: results are being made there; wait until they are done.")
 
 
-def _lists(below: Below, done: Withdrawal) -> None:
-    """Bring the lists of results folders up to date."""
-    changed = _changed(below.links, done)
-    for folder in results_folders(below.files):
-        with refusals(folder / LIST, done.left):
-            if (folder / LIST).exists():
-                relist(folder, changed)
+def _is_shared(path: Path) -> bool:
+    """Whether a file is one that several commands read and write again: a list of participants, or a plan."""
+    try:
+        with path.open("rb") as file:
+            return (path.suffix == ".csv" and b"consent_time" in file.readline(_HEAD)) or (
+                path.suffix == ".json" and is_plan(file.read())
+            )
+    except OSError:  # which will be said
+        return False
 
 
-def _changed(links: dict[Path, Path], done: Withdrawal) -> set[Path]:
-    """All paths at which something changed: also links to files that did. Those to files that went go too."""
-    changed = {Path(name) for name in (*done.removed, *done.renamed)}
-    places = {path.resolve() for path in changed} | {links[path] for path in changed if path in links}
-    for link, place in links.items():
-        if os.path.islink(link) and not os.path.exists(place):
-            _remove([link], done)
-    return changed | {link for link, place in links.items() if place in places}
+# What is to be done.
 
 
-def _remove(paths: Iterable[Path], done: Withdrawal) -> None:
-    for path in paths:
-        with refusals(path, done.left):
-            remove(path)
-            done.removed[str(path)] = 1
+def _planned(root: Path, before: Withdrawal) -> Withdrawal:
+    """Everything that is to be done, and that was to be done when the withdrawal was interrupted. Raises InputError
+    where one of their sessions is running."""
+    below, person = files_below(root), before.participant
+    whose, _ = logs(below.files)
+    theirs = [path for path, name in whose.items() if name == person]
+    if running := next((path for path in theirs if in_use(path)), None):
+        raise InputError(f"{running}: is being written; end the session first.")
+    made = {folder: go for folder in results_folders(below.files) if (go := computed(folder, person, below.files))}
+    go = {*theirs, *_keys(below.files, person, whose), *(path for paths in made.values() for path in paths)}
+    go |= {link for link, place in below.links.items() if place in {path.resolve() for path in go}}
+    tables = _tables(below, go)
+    sets, sets_gone = before.sets, before.sets_gone
+    if not before.begun:  # else some of the tables that decide it are changed
+        sets, sets_gone = sets_of(tables.values(), person, before.label)
+    planned = Withdrawal(
+        **{name: getattr(before, name) for name in ("participant", "label")},
+        files=sorted({*before.files, *(_name(root, path) for path in go)}),
+        sets=sets,
+        sets_gone=sorted(sets_gone),
+    )
+    for path, table in tables.items():
+        edited = without_person(table, person, planned.label, planned.sets, planned.sets_gone)
+        rows = len(table.rows) - len(edited.kept)
+        planned.removed |= {_name(root, path): rows} if rows else {}
+        planned.renamed |= {_name(root, path): edited.renamed} if edited.renamed else {}
+    for path in ending(below.files, ".json"):
+        if path not in go and path.name != LIST and _plan(path, planned) is not None:
+            planned.renamed[_name(root, path)] = 1
+    planned.removed |= before.removed
+    planned.renamed |= before.renamed
+    changed = {root / name for name in (*planned.files, *planned.removed, *planned.renamed)}
+    touched = [place for place in results_folders(below.files) if any(place in path.parents for path in changed)]
+    planned.results = sorted({*before.results, *(_name(root, place) for place in touched)})
+    again = (commands_of(place, person, go, below.files) for place in made if _name(root, place) not in before.results)
+    planned.commands = list(dict.fromkeys([*before.commands, *(line for lines in again for line in lines)]))
+    return planned
 
 
-def _logs(files: Iterable[Path]) -> tuple[dict[Path, str], list[Path]]:
-    """Whose each log is, and the logs that cannot be read."""
-    whose, damaged = {}, []
-    for path in _ending(files, ".session.jsonl"):
-        try:
-            whose[path] = read_log(path)[0].participant
-        except InputError:
-            damaged.append(path)
-    return whose, damaged
+def _name(root: Path, path: Path) -> str:
+    return path.relative_to(root).as_posix()
 
 
 def _keys(files: Iterable[Path], participant: str, whose: dict[Path, str]) -> list[Path]:
@@ -179,101 +234,75 @@ def _keys(files: Iterable[Path], participant: str, whose: dict[Path, str]) -> li
             return person == participant
         return path.name.startswith(begins) and not path.name.startswith(longer)
 
-    return sorted(path for path in _ending(files, ".keys", ".keys.part") if theirs(path))
+    return [path for path in ending(files, ".keys", ".keys.part") if theirs(path)]
 
 
-def _tables(below: Below, done: Withdrawal) -> None:
-    """Their rows of every table; names of their sets that others have compared become nobody's."""
-    paths = _ending(below.files, ".csv", ".parquet")
-    places = {path.resolve() for path in paths if path not in below.links}  # a link to one of these is the same table
+def _tables(below: Below, go: set[Path]) -> dict[Path, Cells]:
+    """The tables that stay, each once, whatever leads to it."""
+    paths = [path for path in ending(below.files, ".csv", ".parquet") if path not in go]
+    places = {path.resolve() for path in paths if path not in below.links}
     paths = [path for path in paths if below.links.get(path) not in places]
-    tables = {path: table for path in paths if (table := read_table(path)) is not None}
-    done.left |= {str(path): _UNREADABLE for path in paths if path.suffix == ".parquet" and path not in tables}
-    names, gone_sets = _sets(tables.values(), done.participant, done.label)
-    for path, table in tables.items():
-        edited = without_person(table, done.participant, done.label, names, gone_sets)
-        rows_removed = len(table.rows) - len(edited.kept)
-        if not (rows_removed or edited.renamed):
-            continue
-        with refusals(path, done.left):
-            if edited.table.rows or path.stem.partition("-")[0] not in _OPTIONAL:
-                write_table(path, edited)
-            else:
-                remove(path)
-            done.removed |= {str(path): rows_removed} if rows_removed else {}
-            done.renamed |= {str(path): edited.renamed} if edited.renamed else {}
-    for path in _ending(below.files, ".nc"):
-        with refusals(path, done.left):
-            rows_removed = netcdf_without(path, done.participant)
-            if rows_removed is None:
-                done.left[str(path)] = _UNREADABLE
-            elif rows_removed:
-                done.removed[str(path)] = rows_removed
+    return {path: table for path in paths if (table := read_table(path)) is not None}
 
 
-def _sets(tables: Iterable[Cells], participant: str, label: str) -> tuple[dict[str, str], set[str]]:
-    """Names of their sets, and what they are called afterwards; and the sets that nobody else has compared."""
-    tables = list(tables)
-    compared = {name for table in tables for name in sets_compared(table, participant)}
-    names = {old: new for table in tables for old, new in set_names(table, participant, label).items()}
-    theirs = {name for table in tables for name in sets_from(table, participant)}
-    coded = {name for table in tables for name in coded_own(table, participant)} - compared
-    same = {name.rpartition(" ")[0] for name in coded}  # the roles of their map that they have not yet compared
-    theirs |= {
-        n for table in tables for n in named_sets(table) if CODED_OWN.fullmatch(n) and n.rpartition(" ")[0] in same
-    }
-    return names, (theirs | set(names)) - compared
-
-
-def _plans(files: Iterable[Path], done: Withdrawal) -> None:
-    for path in _ending(files, ".json"):
-        with refusals(path, done.left):
-            if path.name != LIST and plan_without(path, done.participant, done.label):
-                done.renamed[str(path)] = 1
-
-
-def _coded(files: Iterable[Path]) -> list[Path]:
-    """The files with renderings of individuals' maps that others compare under codes."""
-
-    def holds(path: Path) -> bool:
-        if path.suffix in (".csv", ".parquet"):
-            table = read_table(path)
-            return table is not None and any(CODED_JUDGED.search(name) for name in named_sets(table))
-        with contextlib.suppress(OSError):  # listed already
-            return CODED_JUDGED.search(path.read_text(encoding="utf-8", errors="replace")) is not None
-        return False
-
-    return [path for path in _ending(files, ".csv", ".parquet", ".json", ".jsonl") if holds(path)]
-
-
-def _ending(files: Iterable[Path], *ends: str) -> list[Path]:
-    return [path for path in files if path.name.endswith(ends)]
-
-
-def _left(files: list[Path], participant: str, whose: dict[Path, str], damaged: Iterable[Path]) -> dict[str, str]:
-    """The files that still name somebody, and why they stay."""
-    left = {str(path): "is a log that cannot be read; if it is theirs, delete it" for path in damaged if path in files}
-    ours = {folder / name for folder in results_folders(files) for name in listed(folder).files}
-    for path in (path for path in files if str(path) not in left):
-        if path in whose:
-            named = file_names(path, participant)
-            why = f"is the log of {whose[path]} and names a set of theirs; it is chained, and stays as it is"
-            left |= {str(path): why} if named else {}
-        elif why := _why_left(path, participant, path in ours):
-            left[str(path)] = why
-    return left
-
-
-def _why_left(path: Path, participant: str, ours: bool) -> str:
-    """Why a file that is no log is to be looked at; empty if it is not. `ours`: a file of results."""
-    if not ours and file_is_called_after(path, participant):
-        return "is called after them and is no file that hilbo changes; look at it yourself"
+def _plan(path: Path, planned: Withdrawal) -> str | None:
     try:
-        closed = is_closed(path)
+        return plan_without(path.read_bytes(), planned.participant, planned.label)
+    except OSError:  # which will be said
+        return None
+
+
+# Doing it.
+
+
+def _carry_out(root: Path, planned: Withdrawal, done: Withdrawal) -> dict[str, str]:
+    """Do what is planned, of which some may be done already. Returns what the system refused: file -> why."""
+    refused: dict[str, str] = {}
+    for name in planned.files:
+        with _refusals(root / name, refused):
+            _remove(root / name)
+            done.removed[str(root / name)] = 1
+    for name in sorted({*planned.removed, *planned.renamed}):
+        with _refusals(root / name, refused):
+            _rewrite(root / name, planned)
+            done.removed |= {str(root / name): planned.removed[name]} if name in planned.removed else {}
+            done.renamed |= {str(root / name): planned.renamed[name]} if name in planned.renamed else {}
+    changed = {(root / name).resolve() for name in (*planned.removed, *planned.renamed)}
+    for name in sorted(planned.results, reverse=True):  # those within others first
+        with _refusals(root / name / LIST, refused):
+            list_again(root / name, planned.participant, changed)
+    done.commands += planned.commands
+    return refused
+
+
+@contextlib.contextmanager
+def _refusals(path: Path, refused: dict[str, str]) -> Iterator[None]:
+    """What the system refuses about one file is listed, and the rest of a withdrawal goes on."""
+    try:
+        yield
     except OSError as error:
-        return f"cannot be read ({error.strerror}); if it holds anything of theirs, delete it"
-    if closed:
-        return "" if ours else "cannot be searched; if it holds anything of theirs, delete it"
-    if path.suffix.lower() not in _PICTURES and file_names(path, participant):
-        return "names them and is no file that hilbo changes; look at it yourself"
-    return ""
+        why = f"could not be changed ({error.strerror or error}); if it holds anything of theirs, delete it"
+        refused[str(path)] = why
+
+
+def _remove(path: Path) -> None:
+    """Remove a file; where it is a link, the file itself first, so that what cannot be removed is still found."""
+    path.resolve().unlink(missing_ok=True)
+    path.unlink(missing_ok=True)
+
+
+def _rewrite(path: Path, planned: Withdrawal) -> None:
+    """A table or a plan without the participant; as it is, where that has been done."""
+    if path.suffix == ".json":
+        if (text := _plan(path, planned)) is not None:
+            rewrite_file(path.resolve(), text)
+        return
+    if not path.exists():
+        return
+    if (table := read_table(path)) is None:
+        raise OSError(errno.EIO, "it can no longer be read")
+    edited = without_person(table, planned.participant, planned.label, planned.sets, planned.sets_gone)
+    if not edited.kept and path.stem.partition("-")[0] in _OPTIONAL:
+        _remove(path)
+    elif len(edited.kept) < len(table.rows) or edited.renamed:
+        rewrite_file(path.resolve(), table_content(path, edited))

@@ -53,12 +53,10 @@ def recover(folder: Path) -> list[Path]:
         name, kind = LEFTOVER.fullmatch(path.name).groups()  # type: ignore[union-attr]
         if kind == "old" and not (folder / name).exists():
             path.rename(folder / name)
-        elif kind == "old":
-            shutil.rmtree(path)
-        elif _is_filled(path):
+        elif kind == "part" and _is_filled(path):
             filled.append(path)
         else:
-            shutil.rmtree(path)
+            _remove(path)
     return filled
 
 
@@ -84,6 +82,12 @@ def _is_filled(path: Path) -> bool:
     if file is not None:
         os.close(file)
     return file is None
+
+
+def _remove(folder: Path) -> None:
+    while folder.exists():
+        with contextlib.suppress(FileNotFoundError):  # whoever filled it is removing it too
+            shutil.rmtree(folder)
 
 
 def _beside(out: Path, kind: str) -> Path:

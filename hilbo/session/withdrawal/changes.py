@@ -1,0 +1,250 @@
+"""What is left of a table, a plan and a command without a participant: nothing here changes a file.
+
+A set that was read from somebody's own map may have been compared by others. Where their answers name it, it stays, and
+its name and source have the pseudonym in the place of the id; where nobody's do, it goes. So do sets of their own map
+under a code that their own answers alone name. Names of sets have one of three forms, with a material before it or not:
+`individual:ID`, `ID ROLE`, and `own-ID` of simulated studies of earlier versions. Nothing else in a plan or a table is
+taken for a name: an id such as 1 or a is also a session's label, a number, or a side.
+"""
+
+import contextlib
+import csv
+import io
+import json
+import re
+import shlex
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.session.plan.plan import plan_hash
+from hilbo.session.plan.set_codes import OWN
+from hilbo.study.formats.cell_text import csv_rows
+from hilbo.study.tables.parameter_sets import ROLES
+
+__all__ = [
+    "CODED_JUDGED",
+    "Cells",
+    "Edited",
+    "command_without",
+    "is_plan",
+    "named_sets",
+    "plan_without",
+    "read_table",
+    "sets_of",
+    "table_content",
+    "without_person",
+]
+
+CODED_JUDGED = re.compile(OWN + r"s[0-9a-f]{8}")
+"""In the name of a set of somebody's own map under a code, as others compare it."""
+_CODED_OWN = re.compile(rf"(?:.+ )?s[0-9a-f]{{8}}(?:-\d+)? (?:{'|'.join(ROLES)})")  # as nobody else compares it
+_SET_COLUMNS = ("set_a", "set_b", "first", "preferred", "set_id", "source")
+_NAME_COLUMNS = ("set_a", "set_b", "set_id")
+_COUNT_PEOPLE = ("plan", "simulate", "power")  # commands whose --participants is a number
+
+
+class Cells(NamedTuple):
+    """A table as text: the header, and the rows."""
+
+    head: list[str]
+    rows: list[list[str]]
+    delimiter: str = ","
+
+    def named(self) -> Iterator[dict[str, str]]:
+        """The rows, column -> cell, without blanks around them."""
+        head = [name.strip() for name in self.head]
+        return (dict(zip(head, (cell.strip() for cell in row), strict=False)) for row in self.rows)
+
+
+class Edited(NamedTuple):
+    """What is left of a table."""
+
+    kept: list[int]
+    """The rows that stay, by their number from 0."""
+    table: Cells
+    renamed: int
+    """Rows in which the name of a set has the pseudonym now."""
+
+
+def read_table(path: Path) -> Cells | None:
+    """A CSV or Parquet table; None for what is none that can be read."""
+    try:
+        if path.suffix == ".parquet":
+            from hilbo.study.formats.csv_file import read_cells
+
+            frame = read_cells(path)
+            return Cells(list(map(str, frame.columns)), frame.to_numpy().tolist())
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            reader, delimiter = csv_rows(file, str(path))
+            rows = list(reader)
+    except (OSError, UnicodeDecodeError, csv.Error, InputError):
+        return None
+    return Cells(rows[0], rows[1:], delimiter) if rows else None
+
+
+def table_content(path: Path, edited: Edited) -> bytes:
+    """A table's file without the rows that go. Of Parquet numbers stay the same bits."""
+    if path.suffix == ".parquet":
+        import pandas as pd
+
+        frame, content = pd.read_parquet(path).iloc[edited.kept].copy(), io.BytesIO()
+        for i, column in enumerate(edited.table.head):
+            if column in _SET_COLUMNS:
+                frame[column] = [row[i] for row in edited.table.rows]
+        frame.to_parquet(content, index=False)
+        return content.getvalue()
+    text = io.StringIO()
+    writer = csv.writer(text, delimiter=edited.table.delimiter, lineterminator="\n")
+    writer.writerows([edited.table.head, *edited.table.rows])
+    return text.getvalue().encode()
+
+
+def named_sets(table: Cells) -> set[str]:
+    """All sets that a table names."""
+    return {cells[column] for cells in table.named() for column in _NAME_COLUMNS if cells.get(column)}
+
+
+def sets_of(tables: Iterable[Cells], participant: str, label: str) -> tuple[dict[str, str], set[str]]:
+    """Names of a participant's sets, and what they are called afterwards; and the sets that nobody else compared."""
+    tables, renamed, theirs, compared, coded = list(tables), {}, set(), set(), set()
+    for cells in (cells for table in tables for cells in table.named()):
+        names = {cells.get(column, "") for column in ("set_a", "set_b")} - {""}
+        if cells.get("participant") != participant:
+            compared |= names
+        else:
+            coded |= {name for name in names if _CODED_OWN.fullmatch(name)}
+        by_source = cells.get("source") == OWN + participant and "set_id" in cells
+        theirs |= {cells["set_id"]} if by_source else set()
+        for name in names | ({cells["set_id"]} if cells.get("set_id") else set()):
+            new_name = _renamed_set(name, participant, label, (cells.get("material"),))
+            if new_name == name and by_source and name == cells["set_id"]:
+                new_name = re.sub(rf"(?<![A-Za-z0-9_.-]){re.escape(participant)}(?![\w.-])", label, name)
+            renamed |= {name: new_name} if new_name != name else {}
+    maps = {name.rpartition(" ")[0] for name in coded - compared}  # with the roles that they have not yet compared
+    every = {name for table in tables for name in named_sets(table)}
+    theirs |= {name for name in every if _CODED_OWN.fullmatch(name) and name.rpartition(" ")[0] in maps}
+    return renamed, (theirs | set(renamed)) - compared
+
+
+def _renamed_set(name: str, participant: str, label: str, materials: Iterable[str | None] = ()) -> str:
+    """The name of a set with a label in the place of the id; as it is, where it is not named after the participant."""
+    stated = [material for material in materials if material]
+    for prefix in ("", *(f"{material} " for material in stated)):
+        rest = name[len(prefix) :] if name.startswith(prefix) else ""
+        if rest in (OWN + participant, f"own-{participant}"):
+            return prefix + rest.removesuffix(participant) + label
+        if participant not in stated and rest in [f"{participant} {role}" for role in ROLES]:
+            return prefix + label + rest.removeprefix(participant)
+    return name
+
+
+def without_person(
+    table: Cells, participant: str, label: str, names: Mapping[str, str], sets_gone: Collection[str] = ()
+) -> Edited:
+    """A table without a participant. `names`: sets that are called otherwise now. `sets_gone`: their rows go."""
+    head, kept, rows, renamed = [name.strip() for name in table.head], [], [], 0
+    called = {**names, OWN + participant: OWN + label}
+    for number, (row, cells) in enumerate(zip(table.rows, table.named(), strict=True)):
+        own = cells.get("source") == OWN + participant and "set_id" not in cells
+        if own or cells.get("participant") == participant or cells.get("set_id") in sets_gone:
+            continue
+        columns = [*head, *[""] * (len(row) - len(head))]
+        new_row = [_new_cell(cell, column, called) for column, cell in zip(columns, row, strict=False)]
+        renamed += new_row != row
+        kept.append(number)
+        rows.append(new_row)
+    return Edited(kept, table._replace(rows=rows), renamed)
+
+
+def _new_cell(cell: str, column: str, names: Mapping[str, str]) -> str:
+    """A whole cell that is the name of a set, called otherwise; a and b are sides where a side stands."""
+    side = column in ("first", "preferred") and cell.strip() in ("a", "b")
+    return cell if column not in _SET_COLUMNS or side else names.get(cell.strip(), cell)
+
+
+class _Named(msgspec.Struct):
+    participant: str
+    reissued_from: str | None = None
+
+
+class _PlanLike(msgspec.Struct):
+    hash: str
+    phase: str
+    participants: list[_Named]
+
+
+def is_plan(content: bytes) -> bool:
+    """Whether this is the content of a plan."""
+    try:
+        msgspec.json.decode(content, type=_PlanLike)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return False
+    return True
+
+
+def plan_without(content: bytes, participant: str, label: str) -> str | None:
+    """A plan with a label in the place of a participant, and another hash; `replaces` keeps the one that logs have. A
+    session of their own sets goes. None where a file is no plan, or has nothing of theirs."""
+    if not is_plan(content):
+        return None
+    typed = msgspec.json.decode(content, type=_PlanLike)
+    plan: dict[str, Any] = msgspec.json.decode(content)
+    if participant not in {name for row in typed.participants for name in (row.participant, row.reissued_from)}:
+        return None
+    whole = plan["hash"] == plan_hash(plan)
+    plan["participants"] = [
+        _row_without(row, participant, label, plan.get("materials") or ())
+        for row in plan["participants"]
+        if not (row["participant"] == participant and plan.get("source") == "individual")
+    ]
+    plan["replaces"] = [*plan.get("replaces", []), plan["hash"]]
+    plan["hash"] = plan_hash(plan) if whole else plan["hash"]
+    return json.dumps(plan, indent=1, ensure_ascii=False) + "\n"
+
+
+def _row_without(row: dict[str, Any], participant: str, label: str, materials: Iterable[str | None]) -> dict[str, Any]:
+    """A plan's row with the label where the participant is named, and in names of sets from their map."""
+
+    def person(values: dict[str, Any], *keys: str) -> dict[str, Any]:
+        return values | {key: label for key in keys if values.get(key) == participant}
+
+    def trial(planned: Any) -> Any:
+        sides = {side: planned[side] for side in ("a", "b") if isinstance(planned, dict) and planned.get(side)}
+        new_names = {side: _renamed_set(str(name), participant, label, materials) for side, name in sides.items()}
+        return planned | new_names if new_names else planned
+
+    def block(entry: Any) -> Any:
+        has_trials = isinstance(entry, dict) and isinstance(entry.get("trials"), list)
+        return entry | {"trials": [trial(planned) for planned in entry["trials"]]} if has_trials else entry
+
+    row, header = person(row, "participant", "reissued_from"), row.get("header")
+    if not isinstance(header, dict):
+        return row
+    header = person(header, "participant")
+    if isinstance(sets := header.get("sets"), dict):
+        header["sets"] = {_renamed_set(name, participant, label, materials): values for name, values in sets.items()}
+    if isinstance(blocks := header.get("blocks"), list):
+        header["blocks"] = [block(entry) for entry in blocks]
+    return row | {"header": header}
+
+
+def command_without(command: str, participant: str) -> str:
+    """A command without a participant among those whom it names; empty if it names nobody else."""
+    words, kept = command.split(), []
+    with contextlib.suppress(ValueError):  # a list that somebody changed
+        words = shlex.split(command)
+    names = {"--names"} if words[1:2] and words[1] in _COUNT_PEOPLE else {"--names", "--participants"}
+    for before, word in zip(["", *words], words, strict=False):
+        option, equals, value = word.partition("=") if word.startswith("--") else (before, "", word)
+        people = [name.strip() for name in value.split(",")]
+        if option in names and participant in people:
+            left = ",".join(name for name in people if name != participant)
+            if not left:
+                return ""
+            word = f"{option}={left}" if equals else left
+        kept.append(word)
+    return shlex.join(kept) if kept != words else command

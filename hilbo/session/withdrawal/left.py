@@ -1,0 +1,86 @@
+"""What a withdrawal leaves below a folder that names the participant, or may, and why."""
+
+import contextlib
+from collections.abc import Iterable
+from pathlib import Path
+
+from hilbo.errors import InputError
+from hilbo.session.log.event_log import read_log
+from hilbo.session.log.log_files import is_log
+from hilbo.session.withdrawal.changes import CODED_JUDGED, Cells, Edited, named_sets, read_table, table_content
+from hilbo.session.withdrawal.results import results_folders
+from hilbo.session.withdrawal.traces import called_after, files_below, is_closed, read_text, spelled
+from hilbo.study.results.listing import listed
+
+__all__ = ["ending", "left_below", "logs"]
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".gif")
+
+
+def ending(files: Iterable[Path], *ends: str) -> list[Path]:
+    """The files whose names end so."""
+    return [path for path in files if path.name.endswith(ends)]
+
+
+def logs(files: Iterable[Path]) -> tuple[dict[Path, str], list[Path]]:
+    """Whose each log is, also under another name, and the logs that cannot be read."""
+    whose, damaged = {}, []
+    for path in (path for path in files if path.name.endswith(".session.jsonl") or is_log(path)):
+        try:
+            whose[path] = read_log(path)[0].participant
+        except InputError:
+            damaged.append(path)
+    return whose, damaged
+
+
+def left_below(root: Path, participant: str) -> dict[str, str]:
+    """The files that name somebody, or may, and why they stay."""
+    below = files_below(root)
+    whose, damaged = logs(below.files)
+    left = below.left | {str(path): "is a log that cannot be read; if it is theirs, delete it" for path in damaged}
+    ours = {folder / name for folder in results_folders(below.files) for name in listed(folder).files}
+    for path in below.files:
+        why = "" if str(path) in left else _why_left(path, participant, path in ours, whose.get(path))
+        left |= {str(path): why} if why else {}
+    if coded := [path for path in ending(below.files, ".csv", ".parquet", ".json", ".jsonl") if _holds_coded(path)]:
+        left[str(root)] = (
+            f"{len(coded)} files below hold renderings from individuals' maps under codes, theirs perhaps among them;"
+            f" the values stay with those who compared them: {', '.join(map(str, coded))}"
+        )
+    return left
+
+
+def _why_left(path: Path, participant: str, ours: bool, owner: str | None) -> str:
+    """Why a file is to be looked at; empty if it is not. `ours`: a file of results. `owner`: of a log."""
+    if not ours and owner is None and called_after(path, participant):
+        return "is called after them and is no file that hilbo changes; look at it yourself"
+    try:
+        table = read_table(path) if path.suffix == ".parquet" else None
+        if table is None and is_closed(path):
+            return "" if ours else "cannot be searched; if it holds anything of theirs, delete it"
+        if path.suffix.lower() in _PICTURES:
+            return ""
+        text, suffix = (read_text(path), path.suffix) if table is None else (_as_csv(table), ".csv")
+    except OSError as error:
+        return f"cannot be read ({error.strerror}); if it holds anything of theirs, delete it"
+    if not (word := spelled(text, suffix, participant)):
+        return ""
+    if owner is not None:
+        return f'is the log of {owner} and holds "{word}"; it is chained, and stays as it is'
+    if not spelled(text, suffix, participant, exact=True):
+        return f'holds "{word}", which may be them; only rows of exactly "{participant}" go; look at it yourself'
+    return "names them and is no file that hilbo changes; look at it yourself"
+
+
+def _as_csv(table: Cells) -> str:
+    return table_content(Path("table.csv"), Edited([], table, 0)).decode()
+
+
+def _holds_coded(path: Path) -> bool:
+    """Whether a file has renderings of individuals' maps that others compare under codes."""
+    if path.suffix == ".parquet":
+        table = read_table(path)
+        return table is not None and any(CODED_JUDGED.search(name) for name in named_sets(table))
+    with contextlib.suppress(OSError):  # listed already
+        return CODED_JUDGED.search(path.read_text(encoding="utf-8", errors="replace")) is not None
+    return False
