@@ -34,7 +34,7 @@ from hilbo import Study
 from hilbo.app.pages.session_views import experimenter_view, participant_view
 from hilbo.cli.terminal.console import results
 from hilbo.errors import InputError
-from hilbo.report.participants import json_lines
+from hilbo.report.result_file import json_lines
 from hilbo.report.results import map_dataset
 from hilbo.session.choose.warm_start import read_warm_start
 from hilbo.session.export import tables as log_tables

@@ -205,9 +205,11 @@ def aggregate_cohort(
     beside: dict[str, Any] = {}
     if compare:
         from hilbo.report.study.comparison import write_comparison
+        from hilbo.study.analysis.rule_comparison import compare as compare_rules
 
         say("every rule, with each person left out")
-        compared = write_comparison(study, population.aggregate, folder, seed)
+        rules = compare_rules(study, population.aggregate, seed)
+        compared = write_comparison(study, population.aggregate, rules, folder)
         beside = {"comparison": compared.section, "pictures": compared.pictures}
     return write_results(population, folder, truth, say, left_out=left_out, selection=selection, **beside)
 

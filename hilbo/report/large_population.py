@@ -3,23 +3,21 @@
 The map's grid is coarser, and the figures of progress are left out: each of their points is a fit of everybody.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from scipy.interpolate import RegularGridInterpolator
 
 from hilbo.report.page import results_page
-from hilbo.report.participants import json_lines, people_of
-from hilbo.report.results import optima_table, result, save_figures
+from hilbo.report.participants import people_of
+from hilbo.report.results import result, save_figures, write_numbers
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.batch_optimum import LargeAggregate
-from hilbo.study.formats.json_file import sealed
-from hilbo.study.results.map_netcdf import map_dataset, on_grid, write_map
+from hilbo.study.formats.json_file import Content
+from hilbo.study.results.map_netcdf import map_dataset, on_grid
 
 __all__ = ["population_map", "write_population"]
 
@@ -43,17 +41,13 @@ def write_population(
     seed: int = 0,
     say=lambda text: None,
     left_out: Sequence[str] = (),
-) -> dict[str, Any]:
+) -> Content:
     """Write result.json, optima.csv, map.nc, figures and report.html; returns the content of result.json. `left_out`:
     sentences on who is not in it."""
     people = people_of(study, large)
     content = result(study, large, seed, None, people, left_out)
     say("writing results")
-    with (folder / "result.json").open("w", encoding="utf-8") as file:
-        file.writelines(sealed(json_lines(content)))
-    optima_table(content, people).to_csv(folder / "optima.csv", index=False)
-    grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
-    write_map(grid, folder / "map.nc")
+    write_numbers(content, people, grid, folder)
     say("figures and report")
     figures, drawn = _figures(study, large, grid)
     page = results_page(study, content, save_figures(figures, folder), people, drawn=drawn)

@@ -16,7 +16,8 @@ from hilbo.identification.memory_selection import LIMIT, PAPER, smallest
 from hilbo.identification.sampled import Sampled
 from hilbo.report.page import rendered
 from hilbo.report.passivity import passivity_words
-from hilbo.report.results import as_json, save_figures, versions
+from hilbo.report.result_file import write_result
+from hilbo.report.results import save_figures, versions
 from hilbo.viscoelastic import FOSLS
 
 __all__ = ["identification_result", "renderer_block", "write_identification", "write_passivity"]
@@ -101,7 +102,7 @@ def write_identification(
     """Write result.json, renderer.toml, curves.csv, the figures and report.html. `damping`: the device's, N·s/m."""
     from hilbo.report.figures import mechanics as plotting
 
-    (folder / "result.json").write_text(as_json(content))
+    write_result(content, folder)
     _curves(tests, result, plotting.predicted).to_csv(folder / "curves.csv", index=False)
     figures = {"tests": plotting.curves_figure(tests, result, content["model"]["unit"])}
     if result.rows:
@@ -175,7 +176,7 @@ def _rounded(value, lower, upper):
 
 def write_passivity(model: FOSLS, content: dict[str, Any], folder: Path) -> None:
     """Write result.json and the figures of the set, with a page around them."""
-    (folder / "result.json").write_text(as_json(content))
+    write_result(content, folder)
     page = rendered(
         "material.html",
         content=content | {"versions": versions()},

@@ -1,4 +1,4 @@
-"""What result.json says of each participant, and result.json itself, however many participants there are.
+"""What result.json says of each participant, however many participants there are.
 
 Parameter sets and passivity margins of all participants are computed together; their entries are made one at a time
 while the file is written, since a hundred thousand of them as Python objects would take more memory than the fits.
@@ -12,11 +12,10 @@ import pandas as pd
 from jaxtyping import Float
 
 from hilbo.numerics.tracing import program
-from hilbo.report.json_text import quoted
 from hilbo.search.rendering import derived_of
 from hilbo.study.config import Study
 
-__all__ = ["People", "as_json", "json_lines", "parameter_sets", "people_of"]
+__all__ = ["People", "parameter_sets", "people_of"]
 
 _TOGETHER = 4096  # sets whose mechanics are computed at once
 
@@ -96,22 +95,3 @@ def parameter_sets(study: Study, x: Float[np.ndarray, "M d"]) -> tuple[dict[str,
 def _mechanics(space, x):
     physical = space.to_physical(x)
     return physical, *derived_of(space, physical)
-
-
-def as_json(content: dict[str, Any]) -> str:
-    """The text of result.json; a number that is not finite (after a failed fit) is null."""
-    return "".join(json_lines(content))
-
-
-def json_lines(content: dict[str, Any]) -> Iterator[str]:
-    """The text of result.json piece by piece; `People` are written one entry at a time."""
-    yield "{"
-    for i, (key, value) in enumerate(content.items()):
-        yield f"{',' if i else ''}\n  {quoted(key)}: "
-        if isinstance(value, People):
-            for j, entry in enumerate(value.entries()):
-                yield f"{',' if j else '['}\n    {quoted(entry)}"
-            yield "\n  ]"
-        else:
-            yield quoted(value, indent=2).replace("\n", "\n  ")
-    yield "\n}\n"

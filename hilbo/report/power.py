@@ -1,14 +1,15 @@
 """Results of `hilbo power`: every error as CSV, a summary, a figure, and a page that says what is enough."""
 
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
 from hilbo.report.page import rendered
-from hilbo.report.results import as_json, save_figures, versions
+from hilbo.report.result_file import write_result
+from hilbo.report.results import save_figures, versions
 from hilbo.simulation.power import Plan, power_table, summarise
 from hilbo.study.config import Study
+from hilbo.study.formats.json_file import Content
 
 __all__ = ["enough", "write_power"]
 
@@ -25,9 +26,7 @@ def enough(summary: pd.DataFrame, chance: float = _CHANCE) -> pd.DataFrame:
     return good.reindex(sorted(summary["participants"].unique())).rename("trials").reset_index()
 
 
-def write_power(
-    study: Study, errors: pd.DataFrame, plan: Plan, error: float, cost: dict[str, Any], folder: Path
-) -> dict[str, Any]:
+def write_power(study: Study, errors: pd.DataFrame, plan: Plan, error: float, cost: Content, folder: Path) -> Content:
     """Write the folder of `hilbo power`; returns the content of result.json.
 
     `cost` has `seconds`, `jobs` and `preset`: how long it took on how many cores, and who was simulated.
@@ -49,7 +48,7 @@ def write_power(
         "versions": versions(),
         "warnings": [],
     } | cost
-    (folder / "result.json").write_text(as_json(content), encoding="utf-8")
+    write_result(content, folder)
     pictures = save_figures({"power": power.power_figure(summary, error)}, folder)
     columns = ("optimum_median", "reached", "reached_low", "reached_high", "map_median")
     page = rendered(

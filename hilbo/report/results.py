@@ -16,29 +16,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+import xarray as xr
 from jaxtyping import Array, Float
 
 from hilbo.report.figures.painter import write_figures
 from hilbo.report.page import Pictures, results_page
-from hilbo.report.participants import People, as_json, json_lines, people_of
+from hilbo.report.participants import People, people_of
+from hilbo.report.result_file import write_result
 from hilbo.search.apart import differences, nrmse
 from hilbo.search.rendering import K0_range, Rendering
 from hilbo.study.analysis.cohort_results import CohortResults
 from hilbo.study.analysis.effects import effects_of
 from hilbo.study.analysis.heterogeneity import heterogeneity, in_place, rule_warnings
-from hilbo.study.analysis.model_check import check_sentences, model_check
-from hilbo.study.analysis.region import optimum_region, region_content, region_sentences
+from hilbo.study.analysis.model_check import check_sentences
+from hilbo.study.analysis.region import Region, region_content, region_sentences
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, asked_variance, other_inference
 from hilbo.study.estimate.batch_optimum import LargeAggregate
 from hilbo.study.estimate.learnt import effect_content, learnt_content, learnt_sentences
 from hilbo.study.estimate.location import location_notes, location_sentences
 from hilbo.study.estimate.optimum import Optimum
-from hilbo.study.formats.json_file import sealed
+from hilbo.study.formats.json_file import Content
 from hilbo.study.results.map_netcdf import map_dataset, on_grid, write_map
 
 __all__ = [
-    "as_json",
+    "cohort_content",
     "misses",
     "moved",
     "optima_table",
@@ -46,6 +48,8 @@ __all__ = [
     "result",
     "save_figures",
     "versions",
+    "write_grid",
+    "write_numbers",
     "write_results",
 ]
 
@@ -84,12 +88,13 @@ def result(
     truth: Float[np.ndarray, " d"] | None = None,
     people: People | None = None,
     left_out: Sequence[str] = (),
-) -> dict[str, Any]:
-    """The content of result.json. `left_out`: sentences on who is not in it."""
+    *,
+    region: Region | None = None,
+    check: Content | None = None,
+) -> Content:
+    """The content of result.json. `left_out`: sentences on who is not in it; `region`, `check`: of `CohortResults`."""
     people = people_of(study, aggregate) if people is None else people
     best, whole = aggregate.optimum, None if isinstance(aggregate, LargeAggregate) else aggregate
-    region = None if whole is None else optimum_region(study, whole.map, whole.cohort.trials, seed)
-    check = None if whole is None else model_check(study, whole)
     content = {
         "optimum": optimum_content(study, best) | {"location": _location(study, aggregate, study.rule, best)},
         "participants": people if whole is None else list(people.entries()),
@@ -120,14 +125,14 @@ def result(
     return content
 
 
-def _random_effect(study: Study, aggregate: Aggregate) -> dict[str, Any] | None:
+def _random_effect(study: Study, aggregate: Aggregate) -> Content | None:
     """Of the study's own map, or of the one among the alternatives that has it."""
     maps = (aggregate.map, *aggregate.maps.values())
     map_ = next((each for each in maps if each.effects is not None), None)
     return None if map_ is None else effect_content(study, aggregate.cohort, map_)
 
 
-def _mean_of_optima(study: Study, mean: Float[Array, " d"] | None) -> dict[str, Any] | None:
+def _mean_of_optima(study: Study, mean: Float[Array, " d"] | None) -> Content | None:
     """The mean of everybody's own optimum, which nobody was asked about; None where no optimum was sought."""
     if mean is None:
         return None
@@ -142,7 +147,7 @@ def _location(study: Study, aggregate: Aggregate | LargeAggregate, name: str, op
     return location_notes(study, optimum.x, optimum.sd, asked)
 
 
-def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> dict[str, Any]:
+def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> Content:
     """How far one optimum is from another: NRMSE, and each parameter's way in its unit and in % of its range; from one
     level to another it is 100 %, and the way in words."""
     target, origin = (Rendering.at(study.space, point).shown for point in (x, start))
@@ -175,7 +180,7 @@ def _not_converged(people: People) -> list[str]:
     ]
 
 
-def optimum_content(study: Study, optimum: Optimum) -> dict[str, Any]:
+def optimum_content(study: Study, optimum: Optimum) -> Content:
     """An optimum as result.json holds it."""
     labels, rendering = study.responses, Rendering.at(study.space, optimum.x)
     return {
@@ -222,9 +227,9 @@ def write_results(
     *,
     left_out: Sequence[str] = (),
     selection: str = "",
-    comparison: dict[str, Any] | None = None,
+    comparison: Content | None = None,
     pictures: Pictures | None = None,
-) -> dict[str, Any]:
+) -> Content:
     """Write the results folder; returns the content of result.json.
 
     **Arguments:** `say` is told what is being done; `left_out`: sentences on who is not in it; `selection`,
@@ -232,19 +237,36 @@ def write_results(
     """
     study, aggregate = population.study, population.aggregate
     people = people_of(study, aggregate)
-    content = result(study, aggregate, population.seed, truth, people, left_out)
-    (folder / "result.json").write_text("".join(sealed(json_lines(content))), encoding="utf-8")
-    optima_table(content, people).to_csv(folder / "optima.csv", index=False)
+    content = cohort_content(population, truth, people, left_out)
     say("the population map on a grid")
-    data = map_dataset(study, aggregate.surface)
-    data.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
-    write_map(data, folder / "map.nc")
+    write_numbers(content, people, map_dataset(study, aggregate.surface), folder)
     say("figures and report")
     pictures = save_figures(_figures(population, truth), folder) | (pictures or {})
     shown = {"how": in_place(aggregate.map), "halves": population.progress.splits}
     page = results_page(study, content, pictures, people, selection=selection, comparison=comparison, **shown)
     (folder / "report.html").write_text(page, encoding="utf-8")
     return content
+
+
+def cohort_content(
+    population: CohortResults, truth: Float[np.ndarray, " d"] | None, people: People, left_out: Sequence[str] = ()
+) -> Content:
+    """What result.json holds of a cohort; arguments as `result`."""
+    study, aggregate, seed = population.study, population.aggregate, population.seed
+    return result(study, aggregate, seed, truth, people, left_out, region=population.region, check=population.check)
+
+
+def write_numbers(content: Content, people: People, grid: xr.Dataset, folder: Path) -> None:
+    """Write result.json with its digest, optima.csv, and the map as `write_grid`."""
+    write_result(content, folder, sealed=True)
+    optima_table(content, people).to_csv(folder / "optima.csv", index=False)
+    write_grid(content, grid, folder)
+
+
+def write_grid(content: Content, grid: xr.Dataset, folder: Path) -> None:
+    """Write map.nc, with the rule and the optimum of result.json as attributes."""
+    grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
+    write_map(grid, folder / "map.nc")
 
 
 def save_figures(figures: Mapping[str, Any], folder: Path) -> Pictures:
@@ -256,7 +278,7 @@ def save_figures(figures: Mapping[str, Any], folder: Path) -> Pictures:
     }
 
 
-def optima_table(content: dict[str, Any], people: People) -> pd.DataFrame:
+def optima_table(content: Content, people: People) -> pd.DataFrame:
     """What optima.csv holds: the population's, the alternatives' and everybody's own."""
     claims = {"aggregate": content["optimum"]} | content["alternatives"]
     rows = [

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +10,12 @@ import xarray as xr
 from hilbo.hyperparameters.judged_evidence import judged_sentences
 from hilbo.population.rules.registry import RECOMMENDED
 from hilbo.report.page import Pictures, rendered
-from hilbo.report.results import as_json, optimum_content, save_figures, versions
+from hilbo.report.result_file import write_result
+from hilbo.report.results import optimum_content, save_figures, versions
 from hilbo.study.analysis.robustness import LIMIT, Robustness
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.formats.json_file import Content
 from hilbo.study.results.map_netcdf import map_dataset
 
 __all__ = ["robustness_page", "robustness_result", "write_robustness"]
@@ -25,12 +26,12 @@ _UNRELATED = 0.1
 
 def write_robustness(
     study: Study, cohort: Cohort, check: Robustness, folder: Path, seed: int = 0, left_out: Sequence[str] = ()
-) -> dict[str, Any]:
+) -> Content:
     """Write the folder of `hilbo robustness`; returns the content of result.json. `left_out`: sentences on who is not
     in it."""
     content = robustness_result(study, cohort, check, seed)
     content["warnings"] = [*left_out, *content["warnings"]]
-    (folder / "result.json").write_text(as_json(content))
+    write_result(content, folder)
     maps = [map_dataset(study, lambda x, of=of: of(jnp.asarray(x))) for of in check.maps()]
     both = xr.concat(maps, xr.DataArray(["fixed", "by evidence"], dims="hyperparameters", name="hyperparameters"))
     both.to_netcdf(folder / "map.nc", engine="h5netcdf")
@@ -39,7 +40,7 @@ def write_robustness(
     return content
 
 
-def robustness_page(study: Study, content: dict[str, Any], figures: Pictures) -> str:
+def robustness_page(study: Study, content: Content, figures: Pictures) -> str:
     """One self-contained page of the robustness check."""
     # Of each hyperparameter a list of columns: how each parameter moves with it, in search ranges.
     sensitivity = {name: np.atleast_2d(np.asarray(block).T) for name, block in content["sensitivity"].items()}
@@ -56,7 +57,7 @@ def robustness_page(study: Study, content: dict[str, Any], figures: Pictures) ->
     )
 
 
-def _table(learned: dict[str, Any]) -> str:
+def _table(learned: Content) -> str:
     """[gp] of a study file with what was learnt, to be copied into one."""
     names = ("theta", "variance", "thresholds", "noise")
     return "\n".join(["[gp]", *(f"{name} = {_four_digits(learned[name])}" for name in names)])
@@ -78,7 +79,7 @@ def _figures(study, cohort, check):
     }
 
 
-def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int) -> dict[str, Any]:
+def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int) -> Content:
     """The content of result.json of `hilbo robustness`: both optima, their distance, what was learnt, derivatives."""
     maximum, people = check.maximum, len(cohort.names)
     stacked = [np.broadcast_to(np.asarray(flags), (people,)) for flags in (maximum.converged, maximum.runaway)]

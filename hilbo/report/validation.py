@@ -17,12 +17,14 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from hilbo.report.page import rendered
-from hilbo.report.results import as_json, save_figures, versions
+from hilbo.report.result_file import write_result
+from hilbo.report.results import save_figures, versions
 from hilbo.statistics.paper_tables import PaperTables, aggregate_comparisons, paper_tables, set_sources
 from hilbo.statistics.preferences import rate
 from hilbo.statistics.regression import Regression
 from hilbo.study.config import Study
 from hilbo.study.formats.csv_file import read_cells
+from hilbo.study.formats.json_file import Content
 from hilbo.study.tables.flag_counts import flag_sentences_of
 from hilbo.study.tables.validation import RESPONSES, TIE, check_validation, of_material, read_validation, sets_frame
 
@@ -102,10 +104,10 @@ def safest(table: Regression) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def validation_content(validated: Validated) -> dict[str, Any]:
+def validation_content(validated: Validated) -> Content:
     """As result.json holds it."""
     tables = validated.tables
-    content: dict[str, Any] = {
+    content: Content = {
         "material": validated.material,
         "participants": validated.participants,
         "comparisons": validated.comparisons,
@@ -160,7 +162,7 @@ def validation_figures(validated: Validated) -> dict[str, Any]:
     return figures
 
 
-def validation_section(validated: Validated) -> dict[str, Any]:
+def validation_section(validated: Validated) -> Content:
     """What the page says of one material. `tied`: the table is of the model with ties."""
     return {
         "material": validated.material,
@@ -212,7 +214,7 @@ def write_validation(
     folder: Path,
     seed: int = 0,
     say=lambda text: None,
-) -> dict[str, Any]:
+) -> Content:
     """Write the folder of `hilbo validate`; returns the content of result.json."""
     say("reading")
     table = _read(path, study, material)
@@ -233,7 +235,7 @@ def write_validation(
     flags = flag_sentences_of(table, study.file.exclude_flags, "comparisons")
     content = {"materials": contents, "study": study.file.hash, "seed": seed, "versions": versions()}
     content["warnings"] = [*flags, *named_warnings(dict(zip(names, contents, strict=True)))]
-    (folder / "result.json").write_text(as_json(content), encoding="utf-8")
+    write_result(content, folder)
     page = rendered("validation.html", study=study, content=content, warnings=flags, sections=sections)
     (folder / "report.html").write_text(page, encoding="utf-8")
     return content

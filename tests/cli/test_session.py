@@ -201,7 +201,7 @@ def test_a_plan_takes_no_result_that_is_none(hilbo, tmp_path, changes, sentence)
 
 
 def test_a_result_that_was_changed_is_refused(hilbo, tmp_path):
-    from hilbo.report.participants import json_lines
+    from hilbo.report.result_file import json_lines
     from hilbo.study.formats.json_file import sealed
 
     (tmp_path / "study.toml").write_text(TOML.format(trials=6))

@@ -1,8 +1,11 @@
 """Results folders: numbers against the mechanics' golden ones, formats, pages that explain themselves."""
 
+import ast
 import dataclasses
 import json
+from concurrent.futures import Future
 from html.parser import HTMLParser
+from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,9 +17,11 @@ from studies import answered, plain_study
 from hilbo.kernels import Matern32
 from hilbo.report import participants, results
 from hilbo.report.page import results_page
+from hilbo.report.result_file import as_json
 from hilbo.search.box import Constraint
 from hilbo.search.rendering import K0_range, Rendering
-from hilbo.study.analysis.cohort_results import analyse_cohort
+from hilbo.study.analysis.cohort_results import CohortResults, analyse_cohort
+from hilbo.study.analysis.region import Region, region_sentences
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import aggregate_cohort
 from hilbo.study.estimate.optimum import predict_people
@@ -63,7 +68,7 @@ def test_a_parameter_set_has_its_k0_and_margin():
 
 
 def test_what_is_not_finite_is_null():
-    text = results.as_json({"a": [float("nan"), 1.0], "b": {"c": float("-inf"), "d": "NaN"}, "e": True})
+    text = as_json({"a": [float("nan"), 1.0], "b": {"c": float("-inf"), "d": "NaN"}, "e": True})
     assert json.loads(text) == {"a": [None, 1.0], "b": {"c": None, "d": "NaN"}, "e": True}
 
 
@@ -211,8 +216,8 @@ def test_many_participants_are_written_as_few():
     certificate = {"residual": np.array([1.0, np.nan, 0, 0, 0]), "converged": np.ones(5, bool)}
     people = participants.People(names, np.arange(5), certificate, PAPER.responses, optima, sets, margins)
     content = {"rule": "bcm", "participants": people, "alternatives": {"a": {}}}
-    text = results.as_json(content)
-    listed = results.as_json(content | {"participants": list(people.entries())})
+    text = as_json(content)
+    listed = as_json(content | {"participants": list(people.entries())})
     assert json.loads(text) == json.loads(listed)
     assert json.loads(text)["participants"][1]["certificate"] == {"residual": None, "converged": True}
     without = participants.People(names, np.arange(5), certificate, PAPER.responses, None, None, None)
@@ -226,3 +231,26 @@ def test_a_way_is_said_in_units_and_percent():
     percents = [way["percent"] for way in difference["moved"].values()]
     np.testing.assert_allclose(np.abs(percents), (1.8, 0.4, 6.2, 2.8), atol=0.06)
     assert difference["nrmse"] == pytest.approx(0.0393, abs=5e-4)
+
+
+def test_pages_compute_nothing_of_an_analysis_and_one_module_writes_result_json():
+    """A cohort's region, model check and comparison of rules are parts of its analysis."""
+    computed = {"optimum_region", "model_check", "compare", "follow", "analyse_cohort", "aggregate_cohort"}
+    writers, imported = set(), set()
+    for path in Path(results.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and node.value == "result.json":
+                writers.add(path.name)
+            if isinstance(node, ast.ImportFrom):
+                imported |= {alias.name for alias in node.names}
+    assert writers == {"result_file.py"} and not imported & computed and "CohortResults" in imported
+
+
+def test_the_region_and_the_model_check_are_those_of_the_analysis(written):
+    study, aggregate, content, _ = written
+    assert content["optimum_region"] is None and content["model_check"] is None  # of bcm, and of two people
+    region = Region(np.full((1, study.space.dim), 0.5), np.zeros((1, study.space.dim)), 0.75)
+    population = CohortResults(study, aggregate, Future(), 0, region, None)
+    said = results.cohort_content(population, None, participants.people_of(study, aggregate))
+    assert said["optimum_region"]["volume"] == 0.75
+    assert said["warnings"] == [*content["warnings"], *region_sentences(region)]

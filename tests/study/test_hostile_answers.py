@@ -10,6 +10,8 @@ from studies import SOUND
 
 from hilbo.ordinal_gp import Trials
 from hilbo.report.results import result
+from hilbo.study.analysis.model_check import model_check
+from hilbo.study.analysis.region import optimum_region
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import aggregate_cohort
@@ -48,7 +50,9 @@ def said(rule):
 
     def of(answers):
         learnt = resolved(study, answers)
-        content = result(learnt, aggregate_cohort(learnt, answers, alternatives=False), 0)
+        aggregate = aggregate_cohort(learnt, answers, alternatives=False)
+        region = optimum_region(learnt, aggregate.map, answers.trials)
+        content = result(learnt, aggregate, 0, region=region, check=model_check(learnt, aggregate))
         unit = np.array(content["optimum"]["unit"])
         assert np.isfinite(unit).all() and ((unit >= 0) & (unit <= 1)).all()
         chances = np.array(list(content["optimum"]["class_probabilities"].values()))

@@ -1,17 +1,18 @@
 """Every rule of aggregation beside the study's: comparison.json, comparison.csv, figures, and a section of the page."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from hilbo.report.page import Pictures, heads, number, percent
-from hilbo.report.participants import as_json
+from hilbo.report.result_file import as_json
 from hilbo.report.results import save_figures
-from hilbo.study.analysis.rule_comparison import KNOWN, compare
+from hilbo.study.analysis.rule_comparison import KNOWN
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate
+from hilbo.study.formats.json_file import Content
 
 __all__ = ["Compared", "comparison_section", "comparison_table", "write_comparison"]
 
@@ -22,16 +23,16 @@ _COLUMNS += ("central_95", "central_95_error", "z2", "covered", "optimum_sd")
 class Compared(NamedTuple):
     """A comparison of rules: as data, as a section of the page, and its figures."""
 
-    content: dict[str, Any]
-    section: dict[str, Any]
+    content: Content
+    section: Content
     pictures: Pictures
 
 
-def write_comparison(study: Study, aggregate: Aggregate, folder: Path, seed: int = 0) -> Compared:
-    """Compare all rules and write comparison.json, comparison.csv and the figures into the folder."""
+def write_comparison(study: Study, aggregate: Aggregate, content: Content, folder: Path) -> Compared:
+    """Write comparison.json, comparison.csv and the figures into the folder. `content`: of
+    `rule_comparison.compare`."""
     from hilbo.report.figures import population as plotting
 
-    content = compare(study, aggregate, seed)
     (folder / "comparison.json").write_text(as_json(content))
     comparison_table(content).to_csv(folder / "comparison.csv", index=False)
     best, prior = np.asarray(aggregate.optimum.x), float(aggregate.map.map_prior)
@@ -43,7 +44,7 @@ def write_comparison(study: Study, aggregate: Aggregate, folder: Path, seed: int
     return Compared(content, comparison_section(study, content), save_figures(figures, folder))
 
 
-def comparison_table(content: dict[str, Any]) -> pd.DataFrame:
+def comparison_table(content: Content) -> pd.DataFrame:
     """A row for each rule."""
     rows = []
     for rule, entry in content["rules"].items():
@@ -54,7 +55,7 @@ def comparison_table(content: dict[str, Any]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def comparison_section(study: Study, content: dict[str, Any]) -> dict[str, Any]:
+def comparison_section(study: Study, content: Content) -> Content:
     """What the page shows: `words`, `head` and `rows` of the table, best first, and who was `refused`, with reason."""
     rules = content["rules"]
     compared = {rule: entry for rule, entry in rules.items() if "refused" not in entry}

@@ -6,7 +6,6 @@ in a folder of its name. result.json holds everything by number, `inference.nc` 
 population map.
 """
 
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hilbo.population.rules.registry import RULES
 from hilbo.report import validation
 from hilbo.report.page import Pictures, estimate_words, heads, number, percent, rendered
 from hilbo.report.participants import people_of
-from hilbo.report.results import as_json, optima_table, result, save_figures, versions
+from hilbo.report.result_file import write_result
+from hilbo.report.results import cohort_content, optima_table, save_figures, versions, write_grid
 from hilbo.report.study.checklist import checklist
 from hilbo.report.study.comparison import comparison_section, comparison_table
 from hilbo.report.study.dictionary import dictionary
@@ -28,18 +27,16 @@ from hilbo.report.study.study_figures import comparison_figures, study_figures
 from hilbo.report.validation import Validated, folder_names, named_warnings, validate
 from hilbo.study.analysis.analysis import Analysis, analyse, moved_by_evidence
 from hilbo.study.analysis.heterogeneity import in_place
-from hilbo.study.analysis.rule_comparison import compare
 from hilbo.study.config import Study
 from hilbo.study.file.trial_flags import flag_sentences
 from hilbo.study.folder import Material, StudyFolder
 from hilbo.study.results.arviz_groups import groups, predictive_shares, write_groups
-from hilbo.study.results.map_netcdf import map_dataset, write_map
+from hilbo.study.results.map_netcdf import map_dataset
 from hilbo.study.tables.parameter_sets import ROLES
 
 __all__ = ["write_study"]
 
 _DIGITS = 2  # of measures of people and of ends of intervals, which a few dozen answers decide
-_FEWEST = 3  # people for a comparison of rules: each is left out in turn; parts.html says three
 
 
 def write_study(
@@ -52,8 +49,7 @@ def write_study(
 ) -> dict[str, Any]:
     """Write the results folder of `hilbo report`; returns the content of result.json.
 
-    `analyses`: of materials (by name) whose results are known already. `comparison`: every rule of aggregation with
-    each person left out in turn, which is most of the work.
+    `analyses`: of materials (by name) whose results are known already. `comparison`: as `analyse`, of the others.
     """
     results, contents, sections = [], {}, []
     analyses = {} if analyses is None else analyses
@@ -64,19 +60,20 @@ def write_study(
         def tell(text, words=words):
             say(f"{text}{words}")
 
-        analysis = analyses.get(material.name) or analyse(material.study, material.cohort, seed, tell)
+        analysis = analyses.get(material.name) or analyse(
+            material.study, material.cohort, seed, tell, comparison=comparison
+        )
         validated = _validated(material, folder, tell)
         results.append(Results(material.name, analysis, validated, material.reference, material.reference_name))
         material_folder = out / folders[material.name] if len(folder.materials) > 1 else out
         material_folder.mkdir(exist_ok=True)
-        comparison_content = _compared(analysis, seed, tell) if comparison else None
         tell("figures and tables")
-        content, section = _write_material(material, analysis, validated, comparison_content, material_folder, seed)
+        content, section = _write_material(material, analysis, validated, material_folder, seed)
         contents[material.name] = content
         sections.append(section)
     claims = hypotheses(results) if folder.study.file.report.hypotheses else []
     content = _content(folder, contents, claims, seed)
-    (out / "result.json").write_text(as_json(content), encoding="utf-8")
+    write_result(content, out)
     say("the page")
     page = _page(folder, content, sections, claims, comparison)
     (out / "report.html").write_text(page, encoding="utf-8")
@@ -121,31 +118,21 @@ def _validated(material: Material, folder: StudyFolder, say) -> Validated | None
     return validate(material.validation, folder.sets, material.study.responses, name)
 
 
-def _compared(analysis: Analysis, seed, say) -> dict[str, Any] | None:
-    """Every rule beside the study's; None where people are too few."""
-    if np.sum(analysis.cohort.counts() > 0) < _FEWEST:
-        return None
-    say("comparing the rules of aggregation")
-    return compare(analysis.study, analysis.aggregate, seed, learns=RULES[analysis.study.rule].learns)
-
-
-def _write_material(material, analysis: Analysis, validated, compared, folder: Path, seed):
+def _write_material(material, analysis: Analysis, validated, folder: Path, seed):
     """Files of one material; its content for result.json, and its section of the page."""
     study, people = analysis.study, people_of(analysis.study, analysis.aggregate)
     truth = material.reference if material.reference_name == "the truth" else None
-    content = result(study, analysis.aggregate, seed, truth, people)
+    content = cohort_content(analysis.population, truth, people)
     data = groups(study, analysis.cohort, analysis.aggregate.posteriors, seed=seed)
     write_groups(data, folder / "inference.nc")
-    grid = map_dataset(study, analysis.aggregate.surface)
-    grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
-    write_map(grid, folder / "map.nc")
+    write_grid(content, map_dataset(study, analysis.aggregate.surface), folder)
     tables = _tables(analysis, material, content, people)
     shares = predictive_shares(data, len(study.responses))
     figures, hatched = study_figures(analysis, material, shares)
     pictures = save_figures(figures, folder)
-    if compared is not None:
-        tables["comparison"] = comparison_table(compared)
-        pictures |= save_figures(comparison_figures(compared), folder)
+    if analysis.comparison is not None:
+        tables["comparison"] = comparison_table(analysis.comparison)
+        pictures |= save_figures(comparison_figures(analysis.comparison), folder)
     if validated is not None:
         content["validation"] = validation.validation_content(validated)
         tables |= validation.validation_csv(validated)
@@ -159,7 +146,7 @@ def _write_material(material, analysis: Analysis, validated, compared, folder: P
         "limits": list(analysis.limits),
         "optimised": _optimised(analysis),
         "tolerance": tables["tolerance"].to_dict("records"),
-        "comparison": compared,
+        "comparison": analysis.comparison,
     }
     section = _section(material, analysis, validated, tables, pictures, content)
     items = checklist(analysis, content, validated is not None)

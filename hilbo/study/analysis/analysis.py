@@ -24,6 +24,7 @@ from hilbo.search.candidates import search_points
 from hilbo.study.analysis.cohort_results import CohortResults, Say, analyse_cohort
 from hilbo.study.analysis.heterogeneity import in_place
 from hilbo.study.analysis.progress import Progress
+from hilbo.study.analysis.rule_comparison import FEWEST, compare
 from hilbo.study.analysis.tolerance import Sets, Tolerance, best_mid_worst, tolerance
 from hilbo.study.analysis.tolerance_intervals import Ends, tolerance_ends
 from hilbo.study.cohort import Cohort
@@ -33,6 +34,7 @@ from hilbo.study.estimate.learnt import learnt_sentences, resolved, that_learns
 from hilbo.study.estimate.location import location_sentences
 from hilbo.study.estimate.optimum import map_optimum
 from hilbo.study.exclusion import included
+from hilbo.study.formats.json_file import Content
 
 __all__ = ["Analysis", "Reading", "analyse", "limits_of", "moved_by_evidence"]
 
@@ -60,6 +62,8 @@ class Analysis(NamedTuple):
     left_out: dict[str, str]
     """Who was left out by the study's rule, and why."""
     limits: tuple[str, ...]
+    comparison: Content | None
+    """Every rule of aggregation (`rule_comparison.compare`); None if it was not asked, or people are too few."""
 
     @property
     def study(self) -> Study:
@@ -82,8 +86,11 @@ class Analysis(NamedTuple):
         return self.population.progress
 
 
-def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda text: None) -> Analysis:
-    """Results of one material from all its participants' answers. Raises `InputError` if the rule leaves nobody."""
+def analyse(
+    study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda text: None, *, comparison: bool = False
+) -> Analysis:
+    """Results of one material from all its participants' answers. `comparison`: every rule of aggregation with each
+    person left out in turn, which is most of the work. Raises `InputError` if the rule leaves nobody."""
     say("consistency, lapses and drift of everybody")
     cohort, people, left_out = included(study, everybody)
     population = _with_learnt(analyse_cohort(study, cohort, seed, say), seed, say)
@@ -108,6 +115,7 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
         people,
         left_out,
         limits,
+        _compared(study, aggregate, seed, say) if comparison else None,
     )
 
 
@@ -139,6 +147,14 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
     if counts.max() < planned:
         sentences.append(f"The study plans {planned} trials; nobody has given more than {counts.max()}.")
     return tuple(sentences)
+
+
+def _compared(study: Study, aggregate: Aggregate, seed: int, say: Say) -> Content | None:
+    """Every rule beside the study's; None where people are too few."""
+    if np.sum(aggregate.cohort.counts() > 0) < FEWEST:
+        return None
+    say("comparing the rules of aggregation")
+    return compare(study, aggregate, seed, learns=RULES[study.rule].learns)
 
 
 def _with_learnt(population: CohortResults, seed: int, say: Say) -> CohortResults:

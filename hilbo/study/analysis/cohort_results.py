@@ -1,6 +1,7 @@
-"""What the answers of one cohort say: the aggregate, and how it came about over the trials.
+"""What the answers of one cohort say, computed once: the aggregate, how it came about over the trials, the region of
+the optimum and the model check.
 
-What `hilbo aggregate` writes. `hilbo.study.analysis.analysis` adds what a report says besides, and takes longer to
+`hilbo aggregate` writes these. `hilbo.study.analysis.analysis` adds what a report says besides, and takes longer to
 import.
 """
 
@@ -9,12 +10,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 from hilbo.population.rules.registry import RULES
+from hilbo.study.analysis.model_check import model_check
 from hilbo.study.analysis.progress import Progress, follow
+from hilbo.study.analysis.region import Region, optimum_region
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort, asked_variance
 from hilbo.study.estimate.learnt import resolved
 from hilbo.study.estimate.location import location_sentences, optimum_sentence
+from hilbo.study.formats.json_file import Content
 
 __all__ = ["CohortResults", "Say", "analyse_cohort"]
 
@@ -29,6 +33,10 @@ class CohortResults(NamedTuple):
     following: Future[Progress]
     """What becomes `progress`: computed beside what is read from the aggregate."""
     seed: int
+    region: Region | None
+    """Where the optimum is, with its probability; None for a map without a joint posterior."""
+    check: Content | None
+    """Whether the model fits (`model_check`)."""
 
     @property
     def cohort(self) -> Cohort:
@@ -64,4 +72,5 @@ def analyse_cohort(
     beside = ThreadPoolExecutor(1, "progress")
     following = beside.submit(follow, study, aggregate, seed)
     beside.shutdown(wait=False)
-    return CohortResults(study, aggregate, following, seed)
+    region = optimum_region(study, aggregate.map, cohort.trials, seed)
+    return CohortResults(study, aggregate, following, seed, region, model_check(study, aggregate))

@@ -8,8 +8,6 @@ answers beside that of two predictions from the others' answers alone that know 
 (`hilbo.population.judged.baselines`). Errors are clustered by person, and not below what the probabilities imply.
 """
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 
@@ -18,6 +16,7 @@ from hilbo.population.judged.leave_one_out import LeftOut, clustered, leave_one_
 from hilbo.population.rules.registry import RULES
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate
+from hilbo.study.formats.json_file import Content
 
 __all__ = ["check_sentences", "model_check"]
 
@@ -27,7 +26,7 @@ _BASELINES = {"constant": "the same shares everywhere", "quadratic": "a quadrati
 _GROUPS = 12  # of people, in which the baselines leave them out
 
 
-def model_check(study: Study, aggregate: Aggregate) -> dict[str, Any] | None:
+def model_check(study: Study, aggregate: Aggregate) -> Content | None:
     """For result.json; None for fewer than three people with answers."""
     cohort = aggregate.cohort
     answered = np.flatnonzero(cohort.counts() > 0)
@@ -43,7 +42,7 @@ def model_check(study: Study, aggregate: Aggregate) -> dict[str, Any] | None:
         context = np.concatenate([np.asarray(trials.context)[p][mask[p]] for p in _people(left)])
         places = np.concatenate([x, context[:, None]], axis=1)
     chosen = (left.q[:, None] == np.arange(len(study.responses))[None, :]).astype(float)
-    content: dict[str, Any] = {
+    content: Content = {
         "hyperparameters": "as stated" if study.learnt is None else "learnt from all answers",
         "shares": _shares(study, left, chosen, np.ones(len(left.q), bool)),
         "by_third": [_shares(study, left, chosen, order == third) for third in range(3) if (order == third).any()],
@@ -62,7 +61,7 @@ def model_check(study: Study, aggregate: Aggregate) -> dict[str, Any] | None:
     return content | {"negative_log_density": _densities(left, x, len(study.responses))}
 
 
-def check_sentences(content: dict[str, Any] | None) -> list[str]:
+def check_sentences(content: Content | None) -> list[str]:
     """What does not fit, in one sentence; none where nothing was found."""
     if content is None:
         return []
@@ -116,7 +115,7 @@ def _people(left: LeftOut) -> list[int]:
     return list(dict.fromkeys(left.person.tolist()))
 
 
-def _shares(study: Study, left: LeftOut, chosen: Float[np.ndarray, "n C"], rows: np.ndarray) -> dict[str, Any]:
+def _shares(study: Study, left: LeftOut, chosen: Float[np.ndarray, "n C"], rows: np.ndarray) -> Content:
     """Of every answer: the share that was given and predicted, and the error of the difference."""
     return {
         label: _compared(chosen[rows, c], left.probabilities[rows, c], left.person[rows])
@@ -134,12 +133,12 @@ def _compared(
     return {"given": float(given.mean()), "predicted": float(predicted.mean()), "error": float(np.fmax(error, implied))}
 
 
-def _differs(row: dict[str, Any]) -> bool:
+def _differs(row: Content) -> bool:
     gap = abs(row["given"] - row["predicted"])
     return gap > _WORTH and gap > _ERRORS * row["error"]
 
 
-def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> dict[str, Any] | None:
+def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> Content | None:
     """Answers of one person to a rendering that they had before (with a random effect in one context, a column of x):
     how often they are what the last one there was, and how often they should be."""
     same, expected, person = [], [], []
@@ -157,7 +156,7 @@ def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> dict[str, Any] | Non
     return {"pairs": len(same)} | _compared(np.array(same, float), np.array(expected), np.array(person))
 
 
-def _densities(left: LeftOut, x: Float[np.ndarray, "n d"], categories: int) -> dict[str, Any]:
+def _densities(left: LeftOut, x: Float[np.ndarray, "n d"], categories: int) -> Content:
     """Mean negative log density of the answers, by the map; by the baselines, and what they cost more than the map."""
     _, place = np.unique(left.person, return_inverse=True)
     groups = place % _GROUPS
@@ -170,7 +169,7 @@ def _densities(left: LeftOut, x: Float[np.ndarray, "n d"], categories: int) -> d
         }
         for name, chances in predicted.items():
             costs[name][out] = -np.log(chances[out, left.q[out]])
-    content: dict[str, Any] = {"map": float(left.cost.mean())}
+    content: Content = {"map": float(left.cost.mean())}
     for name, cost in costs.items():
         difference, error = clustered(cost - left.cost, left.person)
         content[name] = {"cost": float(cost.mean()), "difference": difference, "error": error}

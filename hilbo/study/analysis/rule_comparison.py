@@ -42,8 +42,10 @@ from hilbo.study.estimate.aggregate import Aggregate
 from hilbo.study.estimate.learnt import resolved, that_learns
 from hilbo.study.estimate.optimum import map_optimum
 
-__all__ = ["KNOWN", "compare", "differences", "recommendation"]
+__all__ = ["FEWEST", "KNOWN", "compare", "differences", "recommendation"]
 
+FEWEST = 3
+"""People with answers: each is left out in turn, and two must be left. parts.html says three."""
 KNOWN = 0.8
 """Where the map's standard deviation is below so much of what it is without answers, these cover the space."""
 
@@ -59,7 +61,7 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
     Raises InputError for fewer than three people with answers: two must be left when one is left out.
     """
     answered = np.flatnonzero(aggregate.cohort.counts() > 0)
-    if len(answered) < 3:
+    if len(answered) < FEWEST:
         raise InputError(
             f"compare: {len(answered)} people gave answers; at least three are needed, since each is left out in turn."
         )

@@ -17,8 +17,10 @@ import msgspec
 from hilbo.errors import InputError
 from hilbo.search.box import Parameter
 
-__all__ = ["check_values", "converted", "decoded", "digest_of", "read_bytes", "sealed", "unsealed"]
+__all__ = ["Content", "check_values", "converted", "decoded", "digest_of", "read_bytes", "sealed", "unsealed"]
 
+Content = dict[str, Any]
+"""A JSON object: texts, numbers, lists and further objects by their keys."""
 _SEAL = re.compile(rb',\n  "digest": "([0-9a-f]{16})"\n\}\n\Z')
 _END = "\n}\n"
 _SLACK = 1e-9  # of a parameter's range: what rounding may do
