@@ -1,7 +1,7 @@
-"""A call of a program in words that hold for every process: all that its trace may depend on, apart from the code.
+"""Cache key of a call of a program: everything that its trace may depend on, apart from the code.
 
-Two calls with the same words are the same program. What has no such words, a function made inside another, an object
-of a kind that is not known here, raises `NotKeptError`; such a call is traced by every process anew.
+Calls with equal keys share a program. An argument without a stable description (a function defined inside another, an
+object of an unknown type) raises `NotKeptError`; such a call is traced anew by every process.
 """
 
 import dataclasses
@@ -22,16 +22,16 @@ __all__ = ["NotKeptError", "describe", "name_of"]
 
 
 class NotKeptError(Exception):
-    """This call cannot be kept; the words say why."""
+    """The call cannot be cached; the message states why."""
 
 
 def describe(function: Callable, args: tuple, kwargs: dict[str, Any]) -> str:
-    """The words of a call: arrays by shape, type and weakness of the type, all else by value."""
+    """Key of a call: arrays by shape, dtype and weak type, everything else by value."""
     return f"{name_of(function)} {_words(args)} {_words(kwargs)}"
 
 
 def name_of(what: Any) -> str:
-    """Where a function or a class is found again. Raises `NotKeptError` where nothing, or another, is found there."""
+    """Qualified name of a function or class. Raises `NotKeptError` if the name does not lead to it."""
     module, path = getattr(what, "__module__", None), getattr(what, "__qualname__", "")
     named: Any = sys.modules.get(str(module))
     for part in path.split("."):
@@ -42,6 +42,7 @@ def name_of(what: Any) -> str:
 
 
 def _words(what: Any) -> str:
+    """Description of one argument."""
     if isinstance(what, jax.Array):
         return f"array:{what.dtype}{list(what.shape)}{'weak' * _weak(what)}"
     if isinstance(what, np.ndarray | np.generic):
@@ -56,11 +57,12 @@ def _words(what: Any) -> str:
 
 
 def _weak(array: jax.Array) -> bool:
-    """Whether its type gives way to others; random keys do not say."""
+    """Whether an array has a weak type; random keys have no such attribute."""
     return getattr(array, "weak_type", False)
 
 
 def _words_of_parts(what: Any) -> str:
+    """Description of a class, function or container. Raises `NotKeptError` for other types."""
     if isinstance(what, enum.Enum):
         return f"{name_of(type(what))}.{what.name}"
     if isinstance(what, type | FunctionType | BuiltinFunctionType):
@@ -83,8 +85,7 @@ def _words_of_parts(what: Any) -> str:
 
 
 def _words_of_fields(what: Any) -> str:
-    """A record. Of a module of Equinox the arrays in static fields are no arguments of the program, so they are refused
-    like those of every other record."""
+    """Description of a dataclass. Arrays are allowed only in the dynamic fields of an Equinox module."""
     dynamic = isinstance(what, eqx.Module)
     parts = []
     for field in dataclasses.fields(what):
@@ -96,5 +97,6 @@ def _words_of_fields(what: Any) -> str:
 
 
 def _refuse_arrays(static: Any) -> None:
+    """Raise `NotKeptError` if a static value contains an array."""
     if any(isinstance(leaf, jax.Array | np.ndarray) for leaf in jax.tree.leaves(static)):
         raise NotKeptError("an array is part of the program")

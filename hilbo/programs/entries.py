@@ -1,4 +1,4 @@
-"""The folder in which programs are kept: whole entries of this user's, none that is damaged, none beyond a size."""
+"""Folder of cached programs: complete, verified entries that are private to this user, up to a total size."""
 
 import contextlib
 import hashlib
@@ -17,7 +17,7 @@ _SUFFIX = ".program"
 
 
 class Entry(msgspec.Struct, forbid_unknown_fields=True):
-    """A program: the words that it was asked by, the structures of its arguments and results, and its compiled form."""
+    """Cached program: its key, the structures of its arguments and results, and the compiled code."""
 
     words: str
     structure: bytes
@@ -25,14 +25,16 @@ class Entry(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Entries:
-    """The entries of a folder, which is made if need be, for nobody but this user. `remark` is told in a sentence of
-    what could not be used."""
+    """Entries of a folder, which is created private to this user if needed.
+
+    `remark` receives messages about unusable ones.
+    """
 
     def __init__(self, folder: Path, remark: Callable[[str], None], size: int = _SIZE):
         self.folder, self._remark, self._size = folder, remark, size
 
     def read(self, words: str) -> Entry | None:
-        """The entry of these words, if there is one that is whole and this user's."""
+        """Entry with this key; None if it is missing, damaged or not private to this user."""
         path = self._path(words)
         try:
             if not _private(self.folder) or not _private(path):
@@ -54,7 +56,7 @@ class Entries:
         return entry
 
     def write(self, entry: Entry) -> None:
-        """Publish an entry whole, and drop those that were used longest ago where there are too many."""
+        """Write an entry atomically, then delete the least recently used ones beyond the size limit."""
         body = msgspec.msgpack.encode(entry)
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -71,7 +73,7 @@ class Entries:
             self._remark(f"{self.folder}: programs cannot be kept there ({error.strerror}).")
 
     def sizes(self) -> dict[Path, int]:
-        """Bytes of each entry, that which was used longest ago first."""
+        """Size (bytes) of each entry, least recently used first."""
         entries = []
         for path in self.folder.glob(f"*{_SUFFIX}"):
             with contextlib.suppress(FileNotFoundError):  # another process drops it
@@ -79,11 +81,12 @@ class Entries:
         return {path: size for _, path, size in sorted(entries)}
 
     def clear(self) -> None:
-        """Drop every entry."""
+        """Delete every entry."""
         for path in self.sizes():
             path.unlink(missing_ok=True)
 
     def _drop(self) -> None:
+        """Delete the least recently used entries beyond the size limit."""
         sizes = self.sizes()
         total = sum(sizes.values())
         for path, size in sizes.items():
@@ -93,12 +96,15 @@ class Entries:
             total -= size
 
     def _path(self, words: str) -> Path:
+        """File of the entry with this key."""
         return self.folder / f"{hashlib.sha256(words.encode()).hexdigest()}{_SUFFIX}"
 
 
 def _private(path: Path) -> bool:
-    """Whether it is this user's and nobody else may write to it; on Windows, whose rights are others, it is taken to be
-    so in a user's own folder."""
+    """Whether a path belongs to this user and nobody else may write to it.
+
+    On Windows only symbolic links are refused.
+    """
     status = path.lstat()
     if os.name == "nt":
         return not stat.S_ISLNK(status.st_mode)

@@ -1,4 +1,4 @@
-"""Calls of programs answered from what was kept: the keeper that a command sets."""
+"""Cache of compiled programs that a command installs (`numerics.tracing.keep_with`)."""
 
 import functools
 import pickle
@@ -20,13 +20,13 @@ __all__ = ["Programs"]
 
 
 class _Array(NamedTuple):
-    """Where an array stands in a program's result."""
+    """Position of an array in a program's result."""
 
     number: int
 
 
 class _Ready(NamedTuple):
-    """A program that runs: what it computes of a call's arrays, and the result around them."""
+    """Loaded program: maps the arrays of a call to its result."""
 
     run: Callable
     structure: Any
@@ -41,10 +41,10 @@ class _Ready(NamedTuple):
 
 
 class Programs:
-    """Keeps the programs of a package's functions among `entries`.
+    """Cache of the compiled programs of a package, stored in `entries`.
 
-    A program that is not there is traced and compiled. What was written of it is read back and has to give the same
-    bits; what runs, in this process as in every later one, is what was read back.
+    A missing program is traced, compiled, written, and read back; the copy that was read is used if it gives the same
+    bits.
     """
 
     def __init__(self, entries: Entries, package: Path):
@@ -55,13 +55,13 @@ class Programs:
 
     @functools.cached_property
     def _around(self) -> str:
-        """Asked for when a program is: until then nobody may have to know of JAX's devices."""
+        """Part of the key that describes code and environment; computed late, because it initialises JAX's devices."""
         return f"code {self._code}\n{surroundings()}"
 
     def __call__(
         self, function: Callable, args: tuple, kwargs: dict[str, Any]
     ) -> Callable[[Sequence[Any]], Any] | None:
-        """The program of a call as a function of the call's arrays; None if it cannot be kept."""
+        """Program of a call as a function of the call's arrays; None if it cannot be cached."""
         leaves, tree = jax.tree.flatten((args, kwargs))
         try:
             key = (function, tree, tuple(_kind(leaf) for leaf in leaves))
@@ -74,7 +74,7 @@ class Programs:
         return self._known[key]
 
     def _find(self, function, args, kwargs) -> _Ready | None:
-        """From its entry, or made; None if there is no way to keep it."""
+        """Load the program, or compile and write it; None if it cannot be cached."""
         if jax.device_count() > 1:
             return None
         try:
@@ -85,6 +85,7 @@ class Programs:
         return self._make(words, function, args, kwargs) if entry is None else _ready(entry)
 
     def _make(self, words, function, args, kwargs) -> _Ready | None:
+        """Compile, write and read back a program; None if that fails or gives other bits."""
         leaves, tree = jax.tree.flatten((args, kwargs))
         structure = []
 
@@ -116,8 +117,10 @@ class Programs:
 
 
 class _CompiledHere:
-    """Within it nothing comes from JAX's own cache of compiled programs: what was loaded from there and is written
-    again lacks functions when it is loaded (jax 0.10). The setting is one for all threads."""
+    """Context in which JAX's own compilation cache is off, for all threads.
+
+    A program that was loaded from that cache and is serialised again lacks functions when it is loaded (jax 0.10).
+    """
 
     def __init__(self):
         self._lock, self._inside, self._enabled = threading.Lock(), 0, True
@@ -144,12 +147,14 @@ _compiled_here = _CompiledHere()
 
 
 def _ready(entry: Entry) -> _Ready:
+    """Load the program of an entry."""
     _find_lapack()
     given, returned, structure = pickle.loads(entry.structure)
     return _Ready(serialize_executable.deserialize_and_load(entry.compiled, given, returned), structure)
 
 
 def _bits(results: Sequence[Any]) -> list[bytes]:
+    """Results as bytes, for comparison."""
     keys = jax.dtypes.prng_key
     plain = (jax.random.key_data(r) if jax.numpy.issubdtype(r.dtype, keys) else r for r in results)
     return [np.asarray(result).tobytes() for result in plain]
@@ -157,7 +162,7 @@ def _bits(results: Sequence[Any]) -> list[bytes]:
 
 @functools.cache
 def _find_lapack() -> None:
-    """JAX looks for LAPACK when a program that calls it is lowered, which a kept one never is."""
+    """Register LAPACK's functions with XLA, which JAX does only when lowering a program that calls them."""
     jax.jit(jax.lax.linalg.cholesky).lower(np.ones((1, 1)))
 
 
@@ -166,7 +171,7 @@ def _is_array(leaf: Any) -> bool:
 
 
 def _kind(leaf: Any) -> Any:
-    """An array's shape and type; anything else itself, with its type, since 1 is equal to True."""
+    """Part of the in-memory key: shape and dtype of an array; any other leaf with its type, since 1 equals True."""
     if _is_array(leaf):
         return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False), type(leaf)
     return type(leaf), leaf

@@ -1,4 +1,4 @@
-"""All that a program may depend on apart from its call: the code, what computes, the processor, flags and settings."""
+"""Environment on which a compiled program depends: code, versions, processor, devices, flags and settings."""
 
 import functools
 import hashlib
@@ -15,7 +15,7 @@ _ELSEWHERE = ("cache", "log", "debug_info", "dump")  # settings that say where s
 
 
 def surroundings() -> str:
-    """Words that differ wherever a program of the same code might."""
+    """Description of the environment; it differs whenever a program of the same code might."""
     import jax
 
     settings = {
@@ -33,7 +33,7 @@ def surroundings() -> str:
 
 
 def code_digest(package: Path) -> str:
-    """Of every Python file of a package, by name and content."""
+    """Hash of all Python files of a package, by name and content."""
     whole = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         content = path.read_bytes()
@@ -43,7 +43,7 @@ def code_digest(package: Path) -> str:
 
 @functools.cache
 def _processor() -> str:
-    """What the processor can do, as far as the system says it."""
+    """Model and features of the processor, as reported by the system."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

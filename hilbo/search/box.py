@@ -1,9 +1,8 @@
-"""What a study file says of its search space: named parameters with units or levels, linear constraints, and the
-renderer that shows them.
+"""Definition of a search space: named parameters with units or levels, linear constraints, and the renderer.
 
-Numbers alone, checked against each other; loads no JAX. `space` searches in it, and knows which part of it is passive.
-A parameter is continuous, whole numbers, or unordered levels. In physical numbers a level is its place in the list,
-from 0; `Parameter.shown` and `Parameter.number` are the way to its text and back.
+Numbers only, checked against each other; imports no JAX. `space` searches in it and knows its passive part. A parameter
+is continuous, integer, or categorical (unordered levels). In physical numbers a level is its position in the list, from
+0; `Parameter.shown` and `Parameter.number` convert to its text and back.
 """
 
 import math
@@ -23,6 +22,7 @@ MOST_PARAMETERS = 8
 
 
 def _reads_as_a_number(text: str) -> bool:
+    """Whether a text can be parsed as a number."""
     try:
         float(text)
     except ValueError:
@@ -32,10 +32,10 @@ def _reads_as_a_number(text: str) -> bool:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One named parameter, `low` to `high` in `unit`; `scale` says how it lies on [0, 1].
+    """Named parameter, from `low` to `high` in `unit`; `scale` defines its mapping to [0, 1].
 
-    `integer`: only whole numbers may be rendered. `levels`: their names, for a parameter of unordered levels, which
-    runs from 0 to their number less 1; `correlation`: of the latent score at two of them, before any answer.
+    `integer`: only whole numbers are allowed. `levels`: names of the unordered levels of a categorical parameter, which
+    ranges from 0 to their number minus 1; `correlation`: prior correlation of the latent score between two levels.
     """
 
     name: str
@@ -65,10 +65,11 @@ class Parameter:
 
     @classmethod
     def of_levels(cls, name: str, levels: tuple[str, ...], correlation: float = 0.5) -> "Parameter":
-        """A parameter of unordered levels. Raises `InputError`."""
+        """Categorical parameter with unordered levels. Raises `InputError`."""
         return cls(name, 0.0, len(levels) - 1.0, levels=levels, correlation=correlation)
 
     def _check_levels(self, path: str) -> None:
+        """Raise `InputError` for too few, repeated, unprintable or numeric level names, and an invalid correlation."""
         if len(self.levels) < 2:
             raise InputError(f"{path}.levels is {list(self.levels)}; it must have two levels or more.")
         twice = next((level for level in self.levels if self.levels.count(level) > 1), None)
@@ -88,48 +89,48 @@ class Parameter:
 
     @property
     def discrete(self) -> bool:
-        """Whether only some values may be rendered: whole numbers or levels."""
+        """Whether only some values are allowed: whole numbers or levels."""
         return self.integer or bool(self.levels)
 
     @property
     def steps(self) -> int:
-        """How many values may be rendered, of a discrete parameter."""
+        """Number of allowed values of a discrete parameter."""
         return round(self.high - self.low) + 1
 
     def shown(self, value: float) -> float | int | str:
-        """A physical number as tables and people see it: a level's name, a whole number, or the number itself."""
+        """Physical number as shown in tables: name of the level, whole number, or the number itself."""
         if self.levels:
             return self.levels[round(value)]
         return round(value) if self.integer else float(value)
 
     def column(self, values: Float[Any, " n"]) -> Any:
-        """Physical numbers as a column of a table: of levels their names, else the numbers."""
+        """Physical numbers as a table column: names of levels, else the numbers."""
         return [self.shown(value) for value in values] if self.levels else values
 
     def words(self, value: float) -> str:
-        """A physical number in a sentence, without its unit."""
+        """Physical number as text, without its unit."""
         return str(self.shown(value)) if self.discrete else f"{value:.4g}"
 
     def number(self, value: float | str) -> float:
-        """What is shown as a physical number; NaN for the name of no level and for what is no number."""
+        """Inverse of `shown`; NaN for an unknown level and for values that are not numbers."""
         if self.levels:
             return float(self.levels.index(value)) if value in self.levels else math.nan
         return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
 
     def holds(self, value: float) -> bool:
-        """Whether a physical number is one that may be rendered."""
+        """Whether a physical number is an allowed value."""
         return self.low <= value <= self.high and (not self.discrete or value == round(value))
 
     @property
     def range_words(self) -> str:
-        """What a value must be, in words."""
+        """Description of the allowed values."""
         if self.levels:
             return "one of " + ", ".join(self.levels)
         kind = "a whole number" if self.integer else "a number"
         return f"{kind} from {self.low:g} to {self.high:g} {self.unit}".rstrip()
 
     def axis(self, cells: int) -> Float[Any, " k"]:
-        """Values on [0, 1] along an axis of a figure: `cells` even ones, or as many steps at most."""
+        """Values on [0, 1] along an axis of a figure: `cells` uniform ones, or at most as many discrete values."""
         import numpy as np
 
         even = np.linspace(0.0, 1.0, cells)
@@ -139,7 +140,7 @@ class Parameter:
         return np.asarray(self.to_unit(step))
 
     def to_unit(self, value: Real[Any, "..."]) -> Float[Any, "..."]:
-        """Physical value, an array, to [0, 1]; measured from the nearer end, so that both ends are met exactly."""
+        """Map physical values (array) to [0, 1]; computed from the nearer end, so that both ends are exact."""
         xp = namespace_of(value)
         if self.scale == "log":
             above, below = xp.log1p((value - self.low) / self.low), xp.log1p((self.high - value) / value)
@@ -149,8 +150,10 @@ class Parameter:
         return xp.where(above < below, above / width, 1 - below / width)
 
     def to_physical(self, unit: Real[Any, "..."]) -> Float[Any, "..."]:
-        """Inverse of `to_unit`; never leaves [low, high] for a `unit` in [0, 1]. A discrete parameter has its nearest
-        value."""
+        """Inverse of `to_unit`; within [low, high] for a `unit` in [0, 1].
+
+        A discrete parameter is rounded to its nearest value.
+        """
         xp = namespace_of(unit)
         if self.scale == "log":
             ratio = self.high / self.low
@@ -164,7 +167,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Constraint:
-    """`least` <= the sum of weight times parameter over `terms` <= `most`, in physical units; either may be missing."""
+    """Linear constraint `least` <= sum of weight·parameter over `terms` <= `most`, in physical units.
+
+    Either may be None.
+    """
 
     terms: tuple[tuple[str, float], ...]
     least: float | None = None
@@ -172,7 +178,7 @@ class Constraint:
 
     @property
     def words(self) -> str:
-        """Such as `0 <= gain + 2 grains <= 24`."""
+        """Text of the constraint, such as `0 <= gain + 2 grains <= 24`."""
         parts = [
             f"{'-' if w < 0 else '+'} {'' if abs(w) == 1 else f'{abs(w):g} '}{name}" for name, w in self.terms if w
         ]
@@ -222,8 +228,11 @@ class Mechanics:
 
 @dataclass(frozen=True)
 class Box:
-    """Named parameters, and with `mechanics` what renders them; these must then include K1 (N/mm), B1 (N·s^α/mm) and
-    alpha, in any order. `constraints`: linear inequalities between parameters that are no levels."""
+    """Named parameters, optional `mechanics` of the renderer, and linear constraints.
+
+    With `mechanics` the parameters must include K1 (N/mm), B1 (N·s^α/mm) and alpha, in any order. `constraints` may not
+    involve categorical parameters. Raises `InputError` for invalid definitions.
+    """
 
     parameters: tuple[Parameter, ...]
     mechanics: Mechanics | None = None
@@ -244,7 +253,7 @@ class Box:
             self._check_constraint(constraint, f"constraints.{number}")
 
     def _check_constraint(self, constraint: Constraint, path: str) -> None:
-        """Refuse one that is none, or of what is no number."""
+        """Raise `InputError` for an invalid constraint, or one on a categorical parameter."""
         for name, weight in constraint.terms:
             if name not in self.names:
                 raise InputError(
@@ -266,7 +275,7 @@ class Box:
             raise InputError(f"{path}.least is {least}; it must be below most = {most}.")
 
     def _check_model(self) -> None:
-        """What the FO-SLS asks of its parameters."""
+        """Raise `InputError` for parameters that do not suit the FO-SLS."""
         missing = [name for name in ("K1", "B1", "alpha") if name not in self.names]
         if missing:
             raise InputError(f"parameters.{missing[0]} is missing, the renderer's model needs K1, B1 and alpha.")

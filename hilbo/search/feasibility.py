@@ -1,11 +1,11 @@
-"""What may be rendered: the renderer's mechanics and the device's damping, and which K1 they leave for B1 and α.
+"""Feasible parameter sets: passivity on the device and effective damping, and the K1 that they allow given B1 and α.
 
-A parameter set is passive for K1 up to `passivity.largest_K1`, of a prompt force and of one at the delay. With a range
-of effective damping B_eff there is a lowest K1 too: B_eff = 1000·T·β·M1·(K1/(K1 + β·S))² rises with K1 from 0 to
+A parameter set is passive for K1 up to `passivity.largest_K1`, without delay and at the device's delay. With a range of
+effective damping B_eff there is a lowest K1 too: B_eff = 1000·T·β·M1·(K1/(K1 + β·S))² rises with K1 from 0 to
 1000·T·β·M1, so that the range is an interval of K1: with r² = B_eff/(1000·T·β·M1), its ends are K1 = β·S·r/(1 - r),
 infinite for r >= 1.
 
-The search keeps `SEARCH_MARGIN` away from the device's damping, so that a device that checks passivity again in
+The search keeps the margin `SEARCH_MARGIN` to the device's damping, so that a device that checks passivity again in
 float32 never refuses a proposal.
 """
 
@@ -49,7 +49,7 @@ _Physical = Mapping[str, Real[ArrayLike, "..."]]
 
 
 def allowed(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
-    """Whether parameter sets are passive with the search margin, and damped as asked for."""
+    """Whether parameter sets are passive with the search margin, and within the range of effective damping."""
     if m.effective_damping is None:
         return passive(m, physical)
     low, high = m.effective_damping
@@ -59,19 +59,25 @@ def allowed(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
 
 
 def passive(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
-    """Whether parameter sets are passive with the search margin; with a delay, in a column that begins at K1 = 0."""
+    """Whether parameter sets are passive with the search margin.
+
+    With a delay also whether the column starts at K1 = 0.
+    """
     b = m.damping * (1 - SEARCH_MARGIN)
     enough = minimum_damping(m, physical) <= b * (1 + _slack(physical))
     return enough if m.delay == 0 else enough & (least_damping(m.K_eff, m.T, m.delay) <= b)
 
 
 def _slack(physical: _Physical) -> float:
+    """Relative tolerance for rounding."""
     return _ROUNDING * float(jnp.finfo(jnp.result_type(1.0, *_model_parameters(physical))).eps)
 
 
 def minimum_damping(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
-    """The least damping (N·s/m) of a device on which parameter sets are passive, without delay of the force and at the
-    study's delay: the need first falls with the delay and then rises, so that the larger of both covers all between."""
+    """Smallest device damping (N·s/m) for which parameter sets are passive, at every delay up to the study's.
+
+    The needed damping first falls with the delay and then rises, so the larger value at both ends is sufficient.
+    """
     place = *_model_parameters(physical), m.K_eff, m.N, m.T
     prompt = passivity.minimum_damping(*place, memory=m.memory)
     if m.delay == 0:
@@ -86,7 +92,7 @@ def K0_of(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
 
 
 def largest_K1(m: Mechanics, B1: _Batch, alpha: _Batch) -> _Batch:
-    """The largest K1 (N/mm) that is passive with the search margin, without delay and at the delay."""
+    """Largest K1 (N/mm) that is passive with the search margin, without delay and at the study's delay."""
     place = B1, alpha, m.damping * (1 - SEARCH_MARGIN), m.K_eff, m.N, m.T
     prompt = passivity.largest_K1(*place, memory=m.memory)
     if m.delay == 0:
@@ -95,7 +101,7 @@ def largest_K1(m: Mechanics, B1: _Batch, alpha: _Batch) -> _Batch:
 
 
 def K1_range(m: Mechanics, B1: _Batch, alpha: _Batch) -> tuple[_Batch, _Batch]:
-    """The K1 (N/mm) at both ends of the range of effective damping: 0 to inf."""
+    """K1 (N/mm) at both ends of the range of effective damping: 0 to inf."""
     assert m.effective_damping is not None
     memory = span(m.memory, m.N, m.states)
     low, high = (viscoelastic.elementwise(_K1_of, memory, end, B1, alpha, m.T) for end in m.effective_damping)
@@ -103,7 +109,7 @@ def K1_range(m: Mechanics, B1: _Batch, alpha: _Batch) -> tuple[_Batch, _Batch]:
 
 
 def keeps(constraint: Constraint, physical: _Physical) -> Bool[Array, "..."]:
-    """Whether parameter sets keep a linear constraint, to the rounding of its sum."""
+    """Whether parameter sets satisfy a linear constraint, to the rounding of its sum."""
     parts = [weight * jnp.asarray(physical[name]) for name, weight in constraint.terms]
     total, size = functools.reduce(jnp.add, parts), functools.reduce(jnp.add, map(jnp.abs, parts))
     slack = _SUM_ROUNDING * jnp.finfo(total.dtype).eps * size
@@ -115,7 +121,7 @@ def keeps(constraint: Constraint, physical: _Physical) -> Bool[Array, "..."]:
 def K1_interval(
     m: Mechanics, K1: Parameter, constraints: tuple[Constraint, ...], physical: Mapping[str, _Batch]
 ) -> tuple[_Batch, _Batch]:
-    """Lowest and highest K1 on [0, 1] that effective damping and constraints on K1 leave beside other parameters."""
+    """Lowest and highest K1 on [0, 1] allowed by effective damping and constraints, given the other parameters."""
     low, high = jnp.zeros_like(physical["B1"]), jnp.ones_like(physical["B1"])
     ends = [] if m.effective_damping is None else [K1_range(m, physical["B1"], physical["alpha"])]
     for first, last in (*ends, *(_within(constraint, K1, physical) for constraint in constraints)):
@@ -125,7 +131,7 @@ def K1_interval(
 
 
 def _within(constraint: Constraint, K1: Parameter, physical: Mapping[str, _Batch]) -> tuple[_Batch, _Batch]:
-    """Lowest and highest K1 (N/mm) that a constraint on it leaves, a margin inside."""
+    """Lowest and highest K1 (N/mm) allowed by a constraint on it, minus a margin."""
     terms, none = dict(constraint.terms), jnp.zeros_like(physical["B1"])
     weight, margin = terms.pop("K1"), MARGIN * (K1.high - K1.low)
     others = functools.reduce(jnp.add, (each * physical[name] for name, each in terms.items()), none)
@@ -139,7 +145,7 @@ def _within(constraint: Constraint, K1: Parameter, physical: Mapping[str, _Batch
 def _K1_of(
     span: Span, damping: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""], T: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """The K1 with this effective damping."""
+    """K1 with this effective damping; inf or 0 if there is none."""
     beta, kernel_sums = pot_stiffness(B1, alpha, T), sums(alpha, span)
     square = damping / (1000 * T * beta * kernel_sums.moment)
     possible = (square > 0) & (square < 1)
@@ -149,4 +155,5 @@ def _K1_of(
 
 
 def _model_parameters(physical: _Physical) -> tuple[Any, Any, Any]:
+    """K1, B1 and alpha."""
     return physical["K1"], physical["B1"], physical["alpha"]

@@ -1,5 +1,4 @@
-"""Simulated participants, validation sessions and studies whose truth is known, and how many people and trials are
-enough.
+"""Simulated participants, validation sessions and studies with known truth, and power analysis.
 
-Imports `session` and `study`, and what they stand on.
+Imports `session` and `study`, and their dependencies.
 """

@@ -1,4 +1,4 @@
-"""A simulated study as a folder that `hilbo aggregate` and `hilbo report` read: its tables, truth and study file."""
+"""Simulated study as a folder for `hilbo aggregate` and `hilbo report`: its tables, truth and study file."""
 
 import shutil
 from importlib.resources import files
@@ -19,7 +19,7 @@ __all__ = ["Simulated", "simulate_folder"]
 
 
 class Simulated(NamedTuple):
-    """A simulated study, its people's answers, and where their population's optimum truly is, (d,) in the unit cube."""
+    """Simulated study, its participants' responses, and the true optimum of their population, (d,) in the unit cube."""
 
     study: Study
     population: Population
@@ -28,10 +28,10 @@ class Simulated(NamedTuple):
 
 
 def simulate_folder(folder: Path, preset: str | None, count: int, seed: int, source: Path | None = None) -> Simulated:
-    """Simulate `count` people and write trials.csv, truth.csv and study.toml.
+    """Simulate `count` participants and write trials.csv, truth.csv and study.toml.
 
-    `preset`: whose people, as in `population_of`. `source`: a study file in place of the paper's. Raises
-    InputError for a preset that there is not.
+    `preset`: name of the population, as in `population_of`. `source`: a study file instead of the paper's. Raises
+    InputError for an unknown preset.
     """
     path = Path(str(files("hilbo") / "data" / "paper.toml")) if source is None else source
     study = Study.load(path)

@@ -50,7 +50,7 @@ _ONE_CORE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
 class Plan(eqx.Module):
-    """Which numbers of participants and trials are asked about, from how many simulated studies."""
+    """Numbers of participants and trials to evaluate, and the number of simulated studies."""
 
     participants: tuple[int, ...] = eqx.field(static=True)
     trials: tuple[int, ...] = eqx.field(static=True)
@@ -77,10 +77,10 @@ def simulate_power(
 ) -> pd.DataFrame:
     """Errors of every study at every (m, t): columns `study`, `participants`, `trials`, `optimum`, `map`.
 
-    `jobs`: processes, by default as many as there are cores; each is a new one, also if it is alone, and calls `begin`
-    first (float64, a cache), else it computes as JAX does by default. So a script needs `if __name__ == "__main__":`.
-    `say` is told how many studies are done.
-    Raises `InputError` for numbers of people or of answers that the study's rule cannot aggregate.
+    `jobs`: processes, by default as many as there are cores; each is a new one, also if there is only one, and calls
+    `begin` first (float64, a cache), else it computes with JAX's defaults. So a script needs `if __name__ ==
+    "__main__":`. `say` receives the number of finished studies. Raises `InputError` for numbers of participants or
+    responses that the study's rule cannot aggregate.
     """
     _check_rule(study.rule, plan)
     jobs = min(cores() if jobs is None else jobs, plan.studies)
@@ -95,7 +95,7 @@ def simulate_power(
 
 
 def _check_rule(rule: str, plan: Plan) -> None:
-    """Raises InputError for numbers of people or of answers that the rule cannot aggregate."""
+    """Raise InputError for numbers of participants or responses that the rule cannot aggregate."""
     if min(plan.participants) < RULES[rule].least_people:
         raise InputError(
             f'power: the rule "{rule}" learns how people differ and needs two of them; ask for 2 participants or'
@@ -111,13 +111,13 @@ def _check_rule(rule: str, plan: Plan) -> None:
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """Number of CPU cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextlib.contextmanager
 def _pool(jobs: int, initializer: Callable[[], None] | None) -> Iterator[ProcessPoolExecutor]:
-    """Fresh processes with one core each, told by XLA's flags in the environment that they start with."""
+    """Pool of new processes with one core each, set by XLA's flags in their environment."""
     before = os.environ.get("XLA_FLAGS")
     os.environ["XLA_FLAGS"] = f"{before or ''} {_ONE_CORE}".strip()
     try:
@@ -131,7 +131,7 @@ def _pool(jobs: int, initializer: Callable[[], None] | None) -> Iterator[Process
 
 
 def _study_in_process(content: str, rule: str, population_: Population, plan: Plan, index: int) -> pd.DataFrame:
-    """One study, from what can be sent to another process."""
+    """Run one study from arguments that can be sent to another process."""
     study = by_rule(Study.from_dict({"schema": 1} | json.loads(content)), rule)
     return one_study(study, population_, plan, index)
 
@@ -171,23 +171,23 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
 
 
 def _turned(numbers: tuple[int, ...], index: int) -> tuple[int, ...]:
-    """Reversed in every second study: two processes that begin at opposite ends compile half of the programs each, and
-    load the others."""
+    """Numbers in reverse order for every second study, so that two processes share the compilation of the programs."""
     return numbers[:: -1 if index % 2 else 1]
 
 
 def _rms(difference: Float[np.ndarray, "..."]) -> float:
+    """Root mean square."""
     return float(np.sqrt(np.mean(difference**2)))
 
 
 @program
 def _map_top_probability(study: Study, map_: RuleMap, points: Float[Array, "m d"]) -> Float[Array, " m"]:
-    """Probability of a new person's highest answer that the map predicts."""
+    """Predicted probability of the highest response of a new participant, at each point."""
     return map_.class_probabilities(study.gp.likelihood, points)[:, -1]
 
 
 def _with_trials(study: Study, trials: int) -> Study:
-    """The study with another number of trials."""
+    """Copy of the study with another number of trials."""
     content = json.loads(study.file.content)
     content.setdefault("selection", {})["trials"] = trials
     filling = min(study.file.selection.space_filling, trials)
@@ -196,9 +196,9 @@ def _with_trials(study: Study, trials: int) -> Study:
 
 
 def top_probability(persons: Person, categories: int, x: Float[np.ndarray, "m d"]) -> Float[np.ndarray, " m"]:
-    """Probability (m,) that a simulated person, drawn from these, gives the highest answer in the middle of a session.
+    """Probability (m,) of the highest response in the middle of a session, averaged over the simulated persons.
 
-    P = (1 - lapse) Phi((lowest criterion - distance - drift / 2) / noise) + lapse / C, its mean over the persons.
+    P = (1 - lapse) Phi((lowest criterion - distance - drift / 2) / noise) + lapse / C.
     """
     optimum, tolerance = np.asarray(persons.optimum), np.asarray(persons.tolerance)
     away = felt_apart(persons.levels, x[:, None, :], optimum[None])
@@ -210,9 +210,11 @@ def top_probability(persons: Person, categories: int, x: Float[np.ndarray, "m d"
 
 
 def summarise(errors: pd.DataFrame, error: float) -> pd.DataFrame:
-    """For every (m, t): median and quartiles of both errors, and the share of studies whose optimum misses by `error`
-    or less, with its 95 % interval (Wilson); columns end in `_median`, `_low`, `_high`; `reached`. `reached_surely` is
-    the share that these studies prove: its exact (Clopper-Pearson) lower 95 % confidence bound, one-sided."""
+    """Summary for every (m, t): median and quartiles of both errors, and proportion of studies that reach the target.
+
+    The target is an error of the optimum of at most `error`. Columns end in `_median`, `_low`, `_high`; `reached` with
+    its 95 % Wilson interval; `reached_surely` is its exact (Clopper-Pearson) lower 95 % confidence bound, one-sided.
+    """
     groups = errors.groupby(["participants", "trials"])
     table = pd.DataFrame({
         f"{name}_{word}": groups[name].quantile(q)
@@ -230,5 +232,5 @@ def summarise(errors: pd.DataFrame, error: float) -> pd.DataFrame:
 
 
 def power_table(summary: pd.DataFrame, value: str) -> pd.DataFrame:
-    """One of the summary's columns as participants by trials."""
+    """One column of the summary as a table of participants by trials."""
     return summary.pivot(index="participants", columns="trials", values=value)

@@ -1,7 +1,7 @@
-"""Populations by name, from hilbo/data/populations.toml; docs/methods/simulation.md says how they were made.
+"""Named populations, from hilbo/data/populations.toml; docs/methods/simulation.md describes how they were made.
 
-`paper-01` to `paper-30` agree with the paper's individuals and with its validation as well as could be; `paper` is the
-one of them that is nearest to their middle. `paper-individuals` agrees with the individuals alone.
+`paper-01` to `paper-30` agree with the paper's individuals and with its validation as well as possible; `paper` is the
+one of them nearest to their mean. `paper-individuals` agrees with the individuals alone.
 """
 
 import dataclasses
@@ -23,12 +23,14 @@ _STEP = 1.5  # from one criterion to the next, in tolerances, where a study stat
 
 
 def _read() -> dict[str, Population]:
+    """Read all populations."""
     content = tomllib.loads((files("hilbo") / "data" / "populations.toml").read_text(encoding="utf-8"))
     populations = {name: _population(table) for name, table in content["populations"].items()}
     return {"paper": populations[content["paper"]]} | populations
 
 
 def _population(table: dict[str, Any]) -> Population:
+    """Population of one table of the file."""
     values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in table.items()}
     return Population(**values)
 
@@ -37,18 +39,19 @@ PRESETS: dict[str, Population] = _read()
 
 
 def preset_of(name: str) -> Population:
-    """The population of a name. Raises InputError, which lists the names, if there is none."""
+    """Population with this name. Raises InputError, which lists the names, if there is none."""
     if name not in PRESETS:
         raise InputError(f'--preset is "{name}"; there are {", ".join(PRESETS)}.')
     return PRESETS[name]
 
 
 def population_of(study: Study, preset: str | None = None) -> tuple[str, Population]:
-    """What a study's simulated people are called, and the population that they are drawn from: the preset if one is
-    asked for, else the study's [simulation], else `paper` for a study like the paper's, else that table's defaults.
+    """Label and population of a study's simulated participants.
 
-    Its truth may be missing: see `with_truth`. Raises `InputError` for an unknown preset, and for one of other
-    parameters."""
+    The population is the preset if one is given, else the study's [simulation], else `paper` if it fits the study, else
+    the defaults of [simulation]. Its truth may be missing: see `with_truth`. Raises `InputError` for an unknown preset,
+    and for one with other parameters.
+    """
     paper = PRESETS["paper"]
     fits = _of_these_ranges(study, paper) and len(study.responses) == 1 + len(paper.criteria)
     if preset is None and not (study.file.simulation is None and fits):
@@ -71,12 +74,13 @@ def population_of(study: Study, preset: str | None = None) -> tuple[str, Populat
 
 
 def _of_these_ranges(study: Study, population: Population) -> bool:
-    """Whether the population's truth is one of the study's renderings."""
+    """Whether the population's truth lies within the study's parameter ranges."""
     parameters, truth = study.space.parameters, population.truth
     return {p.name for p in parameters} == set(truth) and all(p.low <= truth[p.name] <= p.high for p in parameters)
 
 
 def _stated(study: Study, table: SimulationTable) -> Population:
+    """Population specified in a [simulation] table."""
     dim, steps = study.space.dim, len(study.responses) - 1
     return Population(
         truth={p.name: p.number(table.truth[p.name]) for p in study.space.parameters} if table.truth else {},
@@ -91,7 +95,7 @@ def _stated(study: Study, table: SimulationTable) -> Population:
 
 
 def with_truth(study: Study, population: Population, seed: int) -> Population:
-    """The population with its truth; where it states none, with one drawn evenly from what may be rendered."""
+    """Population with a truth; if it has none, one drawn uniformly from the feasible set."""
     if population.truth:
         return population
     points = np.asarray(study.space.to_physical(study.space.candidates(256, 0)))

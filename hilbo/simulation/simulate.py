@@ -1,13 +1,13 @@
-"""Simulated participants and studies whose truth is known.
+"""Simulated participants and studies with known truth.
 
-A simulated person prefers one rendering and perceives every other at a dissimilarity
+A simulated person prefers one stimulus and perceives every other at a dissimilarity
 
     s = sqrt( sum_i ((x_i - optimum_i) / tolerance_i)^2 ) + drift * (trial / trials) + noise * e,    e ~ N(0, 1),
 
-and answers with the highest category whose criterion s stays below; with probability `lapse` the answer is any
-category. Two different levels of a parameter count as half a range apart, whichever they are. This is deliberately not
-the model that is fitted: its tails are linear where the GP's are bounded.
-A whole study (everybody's space-filling and acquisition trials) runs in one compiled call.
+and responds with the highest category whose criterion exceeds s; with probability `lapse` the response is random. Two
+different levels of a parameter have the distance of half a range. This is deliberately not the model that is fitted:
+its tails are linear where the GP's are bounded. A whole study (all participants' space-filling and acquisition trials)
+runs in one compiled call.
 """
 
 from collections.abc import Mapping
@@ -34,13 +34,13 @@ _LEVELS_APART = 0.5  # of a range
 
 
 class Person(eqx.Module):
-    """A simulated participant; leading axes for several. All in unit-cube coordinates."""
+    """Simulated participant; leading axes for several. All in unit-cube coordinates."""
 
     optimum: Float[Array, "*M d"]
     tolerance: Float[Array, "*M d"]
-    """Distances along each parameter that are felt as one unit of dissimilarity."""
+    """Distance along each parameter that is perceived as one unit of dissimilarity."""
     criteria: Float[Array, "*M c"]
-    """Decreasing, C - 1 of them: below all of them the answer is the highest category."""
+    """Decreasing, C - 1 of them: a dissimilarity below all of them gives the highest category."""
     noise: Float[Array, "*M"]
     lapse: Float[Array, "*M"]
     drift: Float[Array, "*M"]
@@ -48,9 +48,9 @@ class Person(eqx.Module):
     """For each parameter its number of unordered levels, 0 for numbers; empty where all are numbers."""
 
     def answer(self, key: PRNGKeyArray, x: Float[Array, " d"], progress: Float[Array, ""]) -> Int[Array, ""]:
-        """Category of the answer to the rendering `x` after the share `progress` of the session.
+        """Simulate the response to the stimulus `x` after the fraction `progress` of the session.
 
-        `x` (d,) in the unit cube, `progress` from 0 to 1 -> a scalar in 0..C-1.
+        `x` (d,) in the unit cube, `progress` from 0 to 1 -> a category, a scalar in 0..C-1.
         """
         perceive, lapse, guess = jax.random.split(key, 3)
         distance = jnp.sqrt(jnp.sum((felt_apart(self.levels, x, self.optimum) / self.tolerance) ** 2))
@@ -61,17 +61,17 @@ class Person(eqx.Module):
 
 
 def felt_apart(levels: tuple[int, ...], x: Float[Any, "*#batch d"], y: Float[Any, "*#batch d"]) -> Float[Any, "... d"]:
-    """Differences (..., d) of points as simulated people feel them, before they are divided by their tolerances."""
+    """Perceived differences (..., d) of points, before division by the tolerances."""
     return differences(levels, x, y, _LEVELS_APART)
 
 
 class Population(eqx.Module):
-    """From which people are drawn.
+    """Distribution from which simulated participants are drawn.
 
-    `truth` is the rendering, in physical units, around which their optima lie with the standard deviations `spread`
-    (unit cube; redrawn until inside the box and feasible), of levels the share of people who prefer another one;
-    tolerances are log-normal around `tolerance` with the
-    log standard deviation `tolerance_sd`, one factor per person; `drift` has mean 0 and standard deviation `drift_sd`.
+    `truth` is the stimulus, in physical units, around which the optima lie with the standard deviations `spread` (unit
+    cube; redrawn until inside the box and feasible); for a categorical parameter `spread` is the proportion of
+    participants who prefer another level. Tolerances are log-normal around `tolerance` with the log standard deviation
+    `tolerance_sd`, one factor per person; `drift` has mean 0 and standard deviation `drift_sd`.
     """
 
     truth: Mapping[str, float] = eqx.field(static=True)
@@ -87,9 +87,10 @@ class Population(eqx.Module):
 
 
 def people(study: Study, population: Population, count: int, seed: int) -> Person:
-    """`count` people drawn from the population, stacked.
+    """Draw `count` participants from the population, stacked.
 
-    Raises `InputError` if their criteria do not fit the study's number of responses.
+    Raises `InputError` if their criteria do not fit the study's number of responses, and if too few optima are
+    feasible.
     """
     if len(population.criteria) != len(study.responses) - 1:
         raise InputError(
@@ -131,7 +132,7 @@ def _with_levels(
     spread: tuple[float, ...],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "n d"]:
-    """Drawn optima with the truth's levels, and for the share `spread` of people one of the others, evenly."""
+    """Drawn optima with the truth's levels, or for the proportion `spread` of participants another, random level."""
     for i, count in ((i, count) for i, count in enumerate(levels) if count):
         moved = np.where(rng.random(len(drawn)) < spread[i], rng.integers(1, count, len(drawn)), 0)
         drawn[:, i] = (np.rint(truth[i] * (count - 1)) + moved) % count / (count - 1)
@@ -139,9 +140,9 @@ def _with_levels(
 
 
 def simulate_study(study: Study, persons: Person, seed: int) -> Trials:
-    """Everybody's session, stacked trials (M, ...): the study's space-filling and acquisition trials, in one call.
+    """Simulate all sessions: space-filling and acquisition trials, in one call. Returns stacked trials (M, ...).
 
-    Each person has a Latin hypercube of their own; the candidates of the acquisition are shared.
+    Each participant has an individual Latin hypercube; the candidates of the acquisition are shared.
     """
     count = persons.noise.shape[0]
     plan = design(study, seed)
@@ -159,8 +160,11 @@ def _simulate(
     answering: Key[Array, " M"],
     drawing: Key[Array, " M"],
 ) -> Trials:
-    """Everybody's session at once: the trials `initial` first, then those that the acquisition chooses. `answering` are
-    the keys of people's answers, `drawing` those of the acquisition's draws, if it makes any."""
+    """Compiled part of `simulate_study`.
+
+    `initial`: space-filling points; `answering`: random keys of the responses, `drawing`: those of the acquisition's
+    draws.
+    """
     trials = study.file.selection.trials
 
     def answered(state, point, trial):
@@ -206,7 +210,7 @@ def to_table(study: Study, trials: Trials) -> pd.DataFrame:
 
 
 def truth_table(study: Study, population: Population, persons: Person) -> pd.DataFrame:
-    """The optima that were simulated, in physical units: the population's, and everybody's own."""
+    """True optima of the population and of all participants, in physical units."""
     individual_sets = np.asarray(study.space.to_physical(persons.optimum))
     width = max(2, len(str(len(individual_sets))))
     centre = [population.truth[name] for name in study.space.names]

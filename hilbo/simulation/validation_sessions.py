@@ -1,10 +1,10 @@
-"""Simulated validation sessions: people who compare renderings of which they perceive the dissimilarity.
+"""Simulated validation sessions: participants who compare stimuli by their perceived dissimilarity.
 
-New people are drawn from the population of a simulated study. Shown two renderings, a person perceives how unlike each
-is (`simulate.Person`) and prefers the smaller. Side by side the two seem to differ more than they do: the population's
-`contrast` times the difference is added. Each is then put in the class whose criterion it stays below. With probability
-`lapse` each of the three answers is a guess. As in the paper, every pair of best, mid and worst is compared four times
-by everybody, and every individual's set twice with the aggregate's by each of a few judges.
+New participants are drawn from the population of a simulated study. Given two stimuli, a participant perceives the
+dissimilarity of each (`simulate.Person`) and prefers the smaller. Side by side, differences are exaggerated: the
+population's `contrast` times the difference is added. Each is then put in the class whose criterion it stays below.
+With probability `lapse` each of the three responses is a guess. As in the paper, every participant compares each pair
+of best, mid and worst four times, and a few judges compare every individual's set with the aggregate's, twice.
 """
 
 from itertools import combinations
@@ -26,9 +26,9 @@ _TWICE = 2  # that a judge compares an individual's set with the aggregate's
 
 
 def sets_table(study: Study, sets: Sets, individuals: Float[np.ndarray, "M d"]) -> pd.DataFrame:
-    """Best, mid and worst of the aggregate map (the aggregate's set is best), and everybody's own under a code, as in a
-    plan: a sets table with a column `role`.
-    `individuals` (M, d) in the unit cube.
+    """Sets table with best, mid and worst of the aggregate map and all individual sets under a code, as in a plan.
+
+    The aggregate's own set is "best". `individuals` (M, d) in the unit cube.
     """
     rows = [
         {"set_id": role, "source": "aggregate", "role": role} | Rendering.at(study.space, x).shown
@@ -47,7 +47,7 @@ def sets_table(study: Study, sets: Sets, individuals: Float[np.ndarray, "M d"]) 
 def validation_table(
     study: Study, population: Population, table: pd.DataFrame, *, participants: int = 20, judges: int = 8, seed: int = 0
 ) -> pd.DataFrame:
-    """A validation table over the sets of `sets_table`, in a random order for everybody."""
+    """Simulate a validation table over the sets of `sets_table`, in a random order for each participant."""
     rng = np.random.default_rng([seed, 1])
     crowd = people(study, population, participants + judges, seed + 7_919)
     x = {row["set_id"]: _unit(study, row) for _, row in table.iterrows()}
@@ -70,7 +70,7 @@ def validation_table(
 
 
 def _unit(study: Study, row: pd.Series) -> Float[np.ndarray, " d"]:
-    """A row of a sets table in the unit cube."""
+    """Point of the unit cube of a row of a sets table."""
     return np.asarray(study.space.to_unit(np.array([p.number(row[p.name]) for p in study.space.parameters])))
 
 
@@ -83,7 +83,7 @@ def _answer(
     contrast: float,
     rng: np.random.Generator,
 ) -> tuple[list[str], int]:
-    """Classes of two renderings, and which of them is preferred."""
+    """Simulate the classes of two stimuli, and the index of the preferred one."""
     optimum, tolerance = np.asarray(crowd.optimum[person]), np.asarray(crowd.tolerance[person])
     away = (felt_apart(crowd.levels, point, optimum) / tolerance for point in (x, y))
     felt = np.array([np.sqrt(np.sum(each**2)) for each in away])

@@ -125,9 +125,12 @@ def _table_4(table: pd.DataFrame, sources: Mapping[str, str], roles: Mapping[str
 def aggregate_comparisons(
     table: pd.DataFrame, sources: Mapping[str, str], roles: Mapping[str, str] = MappingProxyType({})
 ) -> pd.DataFrame:
-    """Preferences between an aggregate's set and an individual's: `participant`, `set` (the individual's) and
-    `preferred` ("Aggregate-Best", "individual" or "tie"). `sources` and `roles`: of each set, as in a sets table; a
-    comparison with somebody's mid or worst, such as a catch trial, is none of these."""
+    """Preferences between an aggregate's set and an individual's best set.
+
+    Columns `participant`, `set` (the individual's) and `preferred` ("Aggregate-Best", "individual" or "tie"). `sources`
+    and `roles`: of each set, as in a sets table; comparisons with mid or worst sets, such as catch trials, are
+    excluded.
+    """
     left, right = (table[side].map(lambda name: source_kind(sources[name])) for side in ("set_a", "set_b"))
     mixed = ((left == "aggregate") & (right == "individual")) | ((left == "individual") & (right == "aggregate"))
     best = [~table[side].map(lambda name: roles.get(name, "")).isin(ROLES[1:]) for side in ("set_a", "set_b")]
@@ -140,6 +143,7 @@ def aggregate_comparisons(
 
 
 def _need(answers: pd.DataFrame, roles: Sequence[str]) -> None:
+    """Raise `InputError` if a set of these roles was never classified."""
     absent = [name for name in roles if name not in set(answers["set"])]
     if absent:
         raise InputError(f'no comparison classifies the set "{absent[0]}".')

@@ -36,7 +36,7 @@ def classifications(table: pd.DataFrame, responses: Sequence[str] = RESPONSES) -
 
 
 def confusion(table: pd.DataFrame, responses: Sequence[str] = RESPONSES, sets: Sequence[str] = ()) -> pd.DataFrame:
-    """How often each set (row) was put in each class (column, highest first); divide by the row's sum for shares."""
+    """Confusion matrix: number of times each set (row) was put in each class (column, highest first)."""
     answers = classifications(table, responses)
     rows = list(sets) or sorted(answers["set"].unique())
     return pd.crosstab(answers["set"], answers["class"]).reindex(rows, columns=list(responses)[::-1], fill_value=0)
@@ -45,7 +45,7 @@ def confusion(table: pd.DataFrame, responses: Sequence[str] = RESPONSES, sets: S
 def rate(
     success: Sequence | np.ndarray | pd.Series, clusters: Clusters | None = None, *, level: float = 0.95
 ) -> pd.DataFrame:
-    """Share of successes (n,) with each kind of interval.
+    """Proportion of successes (n,) with every kind of interval.
 
     Columns `rate`, `errors`, `low`, `high`, `p_value` (of a rate of 1/2), `assumes`. Raises `InputError`.
     """
@@ -72,21 +72,21 @@ def rate(
 
 
 def preference_rates(table: pd.DataFrame, sets: Sequence[str] = (), *, level: float = 0.95) -> pd.DataFrame:
-    """Of each pair of sets, how often the first was preferred: one row per pair and kind of interval.
+    """For each pair of sets the rate at which the first was preferred: one row per pair and kind of interval.
 
-    `sets` are the ones to compare, in the order in which a pair names them; all, by the alphabet, if none is given.
-    Columns `set`, `over`, `comparisons`, `wins`, `losses`, `ties`, and those of `rate`. A pair with ties only has none.
+    `sets`: the ones to compare, in the order in which a pair names them; default: all, sorted. Columns `set`, `over`,
+    `comparisons`, `wins`, `losses`, `ties`, and those of `rate`. A pair with ties only has none.
     """
     check_level(level)
-    asked = table[table["preferred"] != NONE]
-    names = list(sets) or sorted({*asked["set_a"], *asked["set_b"]})
+    compared = table[table["preferred"] != NONE]
+    names = list(sets) or sorted({*compared["set_a"], *compared["set_b"]})
     place = {name: i for i, name in enumerate(names)}
-    asked = asked[asked["set_a"].isin(names) & asked["set_b"].isin(names)]
-    turned = asked["set_a"].map(place) > asked["set_b"].map(place)
-    one = asked["set_a"].mask(turned, asked["set_b"])
-    other = asked["set_b"].mask(turned, asked["set_a"])
+    compared = compared[compared["set_a"].isin(names) & compared["set_b"].isin(names)]
+    turned = compared["set_a"].map(place) > compared["set_b"].map(place)
+    one = compared["set_a"].mask(turned, compared["set_b"])
+    other = compared["set_b"].mask(turned, compared["set_a"])
     blocks = []
-    for (a, b), rows in asked.groupby([one.map(place), other.map(place)]):
+    for (a, b), rows in compared.groupby([one.map(place), other.map(place)]):
         decided = rows[rows["preferred"] != TIE]
         won = (decided["preferred"] == names[a]).to_numpy()
         counts = {"set": names[a], "over": names[b], "comparisons": len(rows), "wins": int(won.sum())}
@@ -99,7 +99,7 @@ def preference_rates(table: pd.DataFrame, sets: Sequence[str] = (), *, level: fl
 def _unanimous(
     hits: np.ndarray, labels: Mapping[str, np.ndarray], level: float
 ) -> list[tuple[str, float, float, float, str]]:
-    """All agreed: how many people would, from the people who did."""
+    """Intervals by cluster for unanimous responses: proportion of clusters that would agree, from those that did."""
     rows = []
     for name, codes in labels.items():
         people = int(codes.max()) + 1
