@@ -124,8 +124,8 @@ def screen(
         may = jax.vmap(allowed)(lattice.extra)
     values = _Values(kernel.diagonal(x[0]), factor, weights, score)
     columns = _Columns(*_factors(kernel, x, lattice), usable, values)
-    beside = values(gram(kernel, x, lattice.extra.astype(x.dtype)))
-    others, others_hopes = (jnp.where(may, scores, -jnp.inf) for scores in beside)
+    extra = values(gram(kernel, x, lattice.extra.astype(x.dtype)))
+    others, others_hopes = (jnp.where(may, scores, -jnp.inf) for scores in extra)
     search = _best_first(columns, jnp.max(others, initial=-jnp.inf))
     at_top = lattice.points(*search.top)
     if lattice.extra.shape[0]:

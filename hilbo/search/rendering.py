@@ -45,6 +45,11 @@ class Rendering:
         """The values (d,) in the order of the space."""
         return np.array(list(self.values.values()))
 
+    @property
+    def unit(self) -> Float[np.ndarray, " d"]:
+        """Its point (d,) of the unit cube."""
+        return np.asarray(self.space.to_unit(self.point))
+
     @cached_property
     def _derived(self) -> tuple[dict[str, float], float | None]:
         if self.space.mechanics is None:

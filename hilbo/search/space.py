@@ -296,7 +296,7 @@ def _take_between(space: SearchSpace, count: int, seed: int) -> Float[np.ndarray
         x = steps_of(space.parameters, uniform)
         return x, np.asarray(_feasible(space, x))
 
-    return _enough(space, count, *take(count, chunks, place))
+    return _joined(space, count, *take(count, chunks, place))
 
 
 @program
@@ -341,10 +341,10 @@ def _take_feasible(
         x, feasible = _from_box(space, w) if columns is None else _from_columns(space, columns, w)
         return np.asarray(x), np.asarray(feasible)
 
-    return _enough(space, count, *take(count, chunks, place))
+    return _joined(space, count, *take(count, chunks, place))
 
 
-def _enough(
+def _joined(
     space: SearchSpace, count: int, kept: list[Float[np.ndarray, "_ d"]], taken: int, tried: int
 ) -> Float[np.ndarray, "count d"]:
     """Concatenate the points. Raises `InputError` for fewer than `count`."""

@@ -92,7 +92,7 @@ class Maps:
         maps: _Slices = jax.device_get(_slices(study, fitted.posterior, best))
         marks = np.asarray(fitted.posterior.trials.x)[: len(answers.categories)]
         levels = np.array(answers.categories, int) / (len(study.responses) - 1)
-        felt = None if asked is None else np.asarray(study.space.to_unit(Rendering.of(study.space, asked).point))
+        felt = None if asked is None else Rendering.of(study.space, asked).unit
         pairs = enumerate(_pairs(len(names)))
         return [_slice(study, maps, k, pair, marks, levels, felt) for k, pair in pairs]
 

@@ -60,16 +60,12 @@ class Decider:
 
     def __call__(self, trial: dict[str, Any], ask: str) -> str:
         """The label for one question about a trial of the experimenter's view."""
-        unit = {side: self._unit(values) for side, values in trial["renderings"].items()}
+        unit = {side: Rendering.of(self._study.space, values).unit for side, values in trial["renderings"].items()}
         if ask == "preferred":
             return min(unit, key=lambda side: self._distance(unit[side]))
         self._count += 1
         key = jax.random.fold_in(self._key, self._count)
         return self._study.responses[int(self._answer(key, jnp.asarray(unit[ask[-1]])))]
-
-    def _unit(self, values):
-        space = self._study.space
-        return np.asarray(space.to_unit(np.array([values[name] for name in space.names])))
 
     def _distance(self, x):
         away = simulate.felt_apart(self._person.levels, x, np.asarray(self._person.optimum))
@@ -94,12 +90,10 @@ def fast_study(source: Path, target: Path, seconds: float | None, warm_up: int |
 
 def example_sets(study: Study, population: Population) -> dict[str, dict[str, float]]:
     """Best, mid and worst renderings of a simulated population, by their distance from its truth."""
-    space, truth = study.space, population.truth
-    points = space.candidates(256, 0)
-    centre = np.asarray(space.to_unit(np.array([truth[name] for name in space.names])))
-    order = np.argsort(nrmse(points, centre, levels_of(space.parameters)))
-    chosen = {"best": points[order[0]], "mid": points[order[len(order) // 3]], "worst": points[order[-1]]}
-    return {name: Rendering.at(space, x).values for name, x in chosen.items()}
+    space, points = study.space, study.space.candidates(256, 0)
+    order = np.argsort(nrmse(points, Rendering.of(space, population.truth).unit, levels_of(space.parameters)))
+    chosen = {"best": order[0], "mid": order[len(order) // 3], "worst": order[-1]}
+    return {name: Rendering.at(space, points[row]).values for name, row in chosen.items()}
 
 
 @contextlib.contextmanager

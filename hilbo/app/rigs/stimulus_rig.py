@@ -69,11 +69,11 @@ class StimulusRig:
         self._hello: Hello | None = None
         self._run, self._key = "", ""  # of the program that presents; no run while there is none
         self._news, self._moved = asyncio.Event(), asyncio.Event()
-        self._asked: asyncio.Future[Loaded] | None = None  # what the present order's confirmation settles
+        self._confirmation: asyncio.Future[Loaded] | None = None  # what the present order's confirmation settles
         # The confirmation that was accepted last: number of its order, and values.
-        self._given: tuple[int, Mapping[str, float | str] | None] | None = None
+        self._accepted: tuple[int, Mapping[str, float | str] | None] | None = None
         self._since = 0.0  # when the present order was given, monotonic
-        self._stopped: float | None = None  # s that the stop took when it was measured
+        self._stop_s: float | None = None  # s that the stop took when it was measured
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._refused = ""  # what was not taken last, until something is
         self._ended = False
@@ -86,7 +86,7 @@ class StimulusRig:
             return "a person presents, by hand"
         if said is None:
             return "a program that has not joined yet"
-        stop = "" if self._stopped is None else f", stopped within {1000 * self._stopped:.0f} ms"
+        stop = "" if self._stop_s is None else f", stopped within {1000 * self._stop_s:.0f} ms"
         return f"{said.name} {said.version}, {'force' if said.force else 'no force'}{stop}"
 
     # What the program says.
@@ -102,19 +102,20 @@ class StimulusRig:
         if self._run and another:
             raise OverError(_HEARD.format(name=hello.name, silence=self._table.silence))
         if self._run:
-            self._lose("Another program has taken over what presents.")
-        self._hello, self._run, self._key, self._stopped = hello, secrets.token_urlsafe(12), key, None
-        self._see(self.snapshot._replace(lost=f"{hello.name} has joined, and is told to stop, to see that it does."))
-        self._give("stop")
-        self._heard()
-        return {"run": self._run, "silence_s": self._table.silence, "within_s": self._table.within,
-                "study": self._study.name, "parameters": parameters_of(self._study), **self._standing()}  # fmt: skip
+            self._drop_program("Another program has taken over what presents.")
+        self._hello, self._run, self._key, self._stop_s = hello, secrets.token_urlsafe(12), key, None
+        self._update(self.snapshot._replace(lost=f"{hello.name} has joined, and is told to stop, to see that it does."))
+        self._order("stop")
+        self._restart_silence()
+        limits = {"silence_s": self._table.silence, "within_s": self._table.within}
+        study = {"study": self._study.name, "parameters": parameters_of(self._study)}
+        return {"run": self._run, **limits, **study, **self._current_order()}
 
     async def free(self) -> bool:
         """Whether nobody presents: no program was heard for as long as it may be silent, which is waited for."""
         end = time.monotonic() + min(self._table.silence + _TURN, _WAIT)
         while self._run and (left := end - time.monotonic()) > 0:
-            await self._after(self._moved, left)
+            await self._wait_for(self._moved, left)
         return not self._run
 
     async def report(self, report: Report) -> dict[str, Any]:
@@ -124,43 +125,43 @@ class StimulusRig:
         """
         if not self._run or report.run != self._run:
             raise OverError("This run is not the one that presents; say hello first, or end.")
-        self._heard()
+        self._restart_silence()
         try:
-            self._take(report)
+            self._apply(report)
         except OverError as error:
-            self._refused, error.standing = str(error), self._standing()
-            self._see(self.snapshot)
+            self._refused, error.standing = str(error), self._current_order()
+            self._update(self.snapshot)
             raise
         wait = min(report.wait_s, self._table.silence / _PART)
         if report.order == self.order.number and wait and not self._ended:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._news.wait(), wait)
-        return self._standing()
+        return self._current_order()
 
-    def _take(self, report: Report) -> None:
+    def _apply(self, report: Report) -> None:
         """What a report says of the present order, and of contact."""
         order = self.order
         if report.order > order.number:
             raise OverError(f"There is no order {report.order} yet; the newest is {order.number}.")
-        self._see(self.snapshot._replace(contact=report.contact))
+        self._update(self.snapshot._replace(contact=report.contact))
         if report.order < order.number:
-            if report.state == "presented" and (self._given is None or self._given[0] < report.order):
+            if report.state == "presented" and (self._accepted is None or self._accepted[0] < report.order):
                 raise OverError(f"Order {report.order} is over, its confirmation comes too late; now it is another.")
             return
         if report.state == "presented":
-            self._confirmed(order, report)
+            self._confirm(order, report)
         elif report.state == "neutral":
             self._neutral(order)
         elif report.state == "failed":
-            self._miss(f"failed: {report.why or 'the program does not say why'}")
+            self._reject(f"failed: {report.why or 'the program does not say why'}")
 
-    def _confirmed(self, order: Order, report: Report) -> None:
+    def _confirm(self, order: Order, report: Report) -> None:
         if order.do != "present" or order.showing is None:
             raise OverError(f"Order {order.number} is {order.do}; there is nothing to present.")
         if report.trial != order.trial:
             raise OverError(f'Order {order.number} is about trial "{order.trial}", and no other.')
-        if self._given is not None and self._given[0] == order.number:
-            if self._given[1] != report.values and report.values is not None:
+        if self._accepted is not None and self._accepted[0] == order.number:
+            if self._accepted[1] != report.values and report.values is not None:
                 raise OverError(f"Order {order.number} was confirmed with other values before; those count.")
             return
         values: Mapping[str, Any] | None = report.values
@@ -174,33 +175,33 @@ class StimulusRig:
                 check_confirmed(here, asked, values)
         except RefusedError as error:
             if error.code == "off":
-                self._miss(f"off: {error}")
+                self._reject(f"off: {error}")
             raise OverError(str(error)) from None
-        self._given, self._refused = (order.number, report.values), ""
-        if self._asked is not None and not self._asked.done():
+        self._accepted, self._refused = (order.number, report.values), ""
+        if self._confirmation is not None and not self._confirmation.done():
             took = time.monotonic() - self._since
-            self._asked.set_result(Loaded({"values": values, "took_s": took, **self._who()}, took))
+            self._confirmation.set_result(Loaded({"values": values, "took_s": took, **self._program_facts()}, took))
 
     def _neutral(self, order: Order) -> None:
         """It shows nothing: the order that says so is done, and a stop is acknowledged."""
-        self._off("neutral")
+        self._cancel_timer("neutral")
         if order.do == "present":
             return
         if order.do == "stop" and self.snapshot.state != "ESTOP":  # the one to see that it does
-            self._stopped = time.monotonic() - self._since
-            facts = self._who() | {"stop_s": self._stopped}
-            self._see(Snapshot("STOPPED", self.snapshot.contact, None, facts=facts))
-            self._give("neutral")
+            self._stop_s = time.monotonic() - self._since
+            facts = self._program_facts() | {"stop_s": self._stop_s}
+            self._update(Snapshot("STOPPED", self.snapshot.contact, None, facts=facts))
+            self._order("neutral")
         elif self.snapshot.state == "RUNNING":
-            self._see(self.snapshot._replace(state="STOPPED"))
-        elif order.do == "stop" and self._stopped is None:
-            self._stopped = time.monotonic() - self._since
-            self._see(self.snapshot._replace(facts=self._who() | {"stop_s": self._stopped}))
+            self._update(self.snapshot._replace(state="STOPPED"))
+        elif order.do == "stop" and self._stop_s is None:
+            self._stop_s = time.monotonic() - self._since
+            self._update(self.snapshot._replace(facts=self._program_facts() | {"stop_s": self._stop_s}))
         self._moved.set()
 
-    def _miss(self, why: str) -> None:
-        if self._asked is not None and not self._asked.done():
-            self._asked.set_exception(MissedError(why))
+    def _reject(self, why: str) -> None:
+        if self._confirmation is not None and not self._confirmation.done():
+            self._confirmation.set_exception(MissedError(why))
 
     # What the session wants.
 
@@ -212,33 +213,33 @@ class StimulusRig:
 
     async def show(self, showing: Showing) -> Loaded | None:
         """Ordered as soon as nobody touches it, where it moves something, and confirmed in time."""
-        self._ready()
+        self._check_present()
         if showing.show == "neutral":
             await self.blank()
             return None
-        while self._moves and self.snapshot.contact:
-            await self._after(self._moved)
-            self._ready()
+        while self._has_force and self.snapshot.contact:
+            await self._wait_for(self._moved)
+            self._check_present()
         name = f"{self._tag}:{showing.trial}.{showing.presentation}"
-        self._asked = asyncio.get_running_loop().create_future()
-        self._give("present", showing, name)
-        self._see(self.snapshot._replace(state="RUNNING"))
+        self._confirmation = asyncio.get_running_loop().create_future()
+        self._order("present", showing, name)
+        self._update(self.snapshot._replace(state="RUNNING"))
         try:
-            confirmed = await asyncio.wait_for(self._asked, self._table.within)
+            confirmed = await asyncio.wait_for(self._confirmation, self._table.within)
         except TimeoutError:
-            self._give("neutral")
+            self._order("neutral")
             raise MissedError(f"late: nothing was confirmed within {self._table.within:g} s") from None
         except MissedError:
-            self._give("neutral")
+            self._order("neutral")
             raise
         finally:
-            self._asked = None
+            self._confirmation = None
         return None if showing.values is None else confirmed
 
     async def blank(self) -> None:
         """Nothing is shown while somebody answers."""
         if self.order.do == "present":
-            self._give("neutral")
+            self._order("neutral")
 
     rest = blank
 
@@ -247,95 +248,99 @@ class StimulusRig:
         if self.snapshot.lost:
             raise RuntimeError(self.snapshot.lost)
         assert self._hello is not None
-        self._see(self.snapshot._replace(state="ESTOP", reason="stopped by the experimenter", facts=self._who()))
-        self._stopped = None
-        self._break_off("stopped by the experimenter")
-        self._give("stop")
+        self._update(
+            self.snapshot._replace(state="ESTOP", reason="stopped by the experimenter", facts=self._program_facts())
+        )
+        self._stop_s = None
+        self._abort_confirmation("stopped by the experimenter")
+        self._order("stop")
         end = time.monotonic() + self._hello.neutral_within_s + _TRAVEL
-        while self._stopped is None:
+        while self._stop_s is None:
             if time.monotonic() > end:
-                what = "use the switch beside the hand" if self._moves else "look at it"
+                what = "use the switch beside the hand" if self._has_force else "look at it"
                 raise RuntimeError(f"it has not acknowledged the stop; {what}.")
-            await self._after(self._moved, end - time.monotonic())
+            await self._wait_for(self._moved, end - time.monotonic())
 
     async def clear(self) -> None:
         """Go on after a stop that was acknowledged. Raises RuntimeError."""
-        self._ready()
+        self._check_present()
         if self.snapshot.state == "ESTOP":
-            if self._stopped is None:
+            if self._stop_s is None:
                 raise RuntimeError("The stop has not been acknowledged; nothing goes on before that.")
-            self._see(self.snapshot._replace(state="STOPPED", reason=""))
-            self._give("neutral")
+            self._update(self.snapshot._replace(state="STOPPED", reason=""))
+            self._order("neutral")
 
     def hang_up(self) -> None:
         """Whoever waits for an order is told to be neutral."""
         self._ended = True
-        self._give("neutral")
+        self._order("neutral")
         for what in list(self._timers):
-            self._off(what)
+            self._cancel_timer(what)
 
     def close(self) -> None:
         """The server ends; a program that hears nothing any more goes neutral by itself."""
 
     # How long things may take.
 
-    def _give(self, do: str, showing: Showing | None = None, trial: str = "") -> None:
+    def _order(self, do: str, showing: Showing | None = None, trial: str = "") -> None:
         """A new order, and who moves something says in time that it is neutral."""
         if self.order.do != "present" or do != "present":
-            self._off("neutral")
-        self._set(Order(self.order.number + 1, do, showing, trial))
+            self._cancel_timer("neutral")
+        self._replace_order(Order(self.order.number + 1, do, showing, trial))
         program = self._hello
         if program is not None and do != "present" and (program.force or do == "stop"):
             words = f"{program.name} has not said that it is neutral, {program.neutral_within_s:g} s after it was told."
-            self._on("neutral", program.neutral_within_s + _TRAVEL, words)
+            self._start_timer("neutral", program.neutral_within_s + _TRAVEL, words)
 
-    def _heard(self) -> None:
+    def _restart_silence(self) -> None:
         said = self._hello
         words = f"{said.name if said else 'The program'} has been silent for {self._table.silence:g} s."
-        self._on("silence", self._table.silence, words)
+        self._start_timer("silence", self._table.silence, words)
 
-    def _on(self, what: str, seconds: float, words: str) -> None:
+    def _start_timer(self, what: str, seconds: float, words: str) -> None:
         """The program is lost unless something comes before the time is over."""
-        self._off(what)
+        self._cancel_timer(what)
         if not self._ended:
-            self._timers[what] = asyncio.get_running_loop().call_later(seconds, self._lose, words)
+            self._timers[what] = asyncio.get_running_loop().call_later(seconds, self._drop_program, words)
 
-    def _off(self, what: str) -> None:
+    def _cancel_timer(self, what: str) -> None:
         timer = self._timers.pop(what, None)
         if timer is not None:
             timer.cancel()
 
-    def _lose(self, words: str) -> None:
+    def _drop_program(self, words: str) -> None:
         """The program is not believed any more, and has to say hello again."""
         for what in list(self._timers):
-            self._off(what)
+            self._cancel_timer(what)
         self._run = ""
-        self._break_off(words)
-        self._set(Order(self.order.number + 1, "neutral"))
-        self._see(self.snapshot._replace(lost=words, state="LOST", contact=False, facts=self._who(), excused=False))
+        self._abort_confirmation(words)
+        self._replace_order(Order(self.order.number + 1, "neutral"))
+        self._update(
+            self.snapshot._replace(lost=words, state="LOST", contact=False, facts=self._program_facts(), excused=False)
+        )
 
-    def _break_off(self, words: str) -> None:
+    def _abort_confirmation(self, words: str) -> None:
         """Nobody waits any more for a confirmation, which is no fault of the trial."""
-        if self._asked is not None and not self._asked.done():
-            self._asked.set_exception(RuntimeError(words))
+        if self._confirmation is not None and not self._confirmation.done():
+            self._confirmation.set_exception(RuntimeError(words))
 
-    def _set(self, order: Order) -> None:
+    def _replace_order(self, order: Order) -> None:
         """Whoever waits for an order has this one."""
         self.order, self._since = order, time.monotonic()
         self._news.set()
         self._news = asyncio.Event()
 
-    def _ready(self) -> None:
+    def _check_present(self) -> None:
         if self.snapshot.lost:
             raise RuntimeError(self.snapshot.lost)
 
-    async def _after(self, event: asyncio.Event, seconds: float = 1.0) -> None:
+    async def _wait_for(self, event: asyncio.Event, seconds: float = 1.0) -> None:
         event.clear()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(event.wait(), seconds)
 
-    def _see(self, seen: Snapshot) -> None:
-        rows = (("Contact", "yes" if seen.contact else "no"),) if self._moves else ()
+    def _update(self, seen: Snapshot) -> None:
+        rows = (("Contact", "yes" if seen.contact else "no"),) if self._has_force else ()
         seen = seen._replace(rows=(*rows, ("Refused", self._refused)) if self._refused else rows)
         before, self.snapshot = self.snapshot, seen
         if seen != before:
@@ -343,13 +348,13 @@ class StimulusRig:
             self._changed(seen)
 
     @property
-    def _moves(self) -> bool:
+    def _has_force(self) -> bool:
         return self._hello is not None and self._hello.force
 
-    def _standing(self) -> dict[str, Any]:
+    def _current_order(self) -> dict[str, Any]:
         """The order that stands, as it is sent."""
         return as_sent(self.order, self._study, self._tag)
 
-    def _who(self) -> dict[str, Any]:
+    def _program_facts(self) -> dict[str, Any]:
         program = self._hello
         return {} if program is None else {"program": program.name, "version": program.version, "force": program.force}

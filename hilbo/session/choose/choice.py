@@ -21,7 +21,7 @@ from hilbo.ordinal_gp import Posterior
 from hilbo.search.apart import differences
 from hilbo.search.rendering import Rendering
 from hilbo.session.choose.ask_tell import Session
-from hilbo.session.choose.selection import point_apart
+from hilbo.session.choose.selection import point_away_from
 from hilbo.session.choose.step import Fitted
 from hilbo.session.choose.warm_start import WarmStart, warm_point
 from hilbo.session.log.state import LiveSession
@@ -173,7 +173,7 @@ def _padded(study: Study, excluded: Float[np.ndarray, "k d"]) -> Float[Array, "r
 
 @program
 def _highest_apart(study, plan, posterior, excluded):
-    return study.space.to_physical(point_apart(study, plan, posterior, excluded, APART))
+    return study.space.to_physical(point_away_from(study, plan, posterior, excluded, APART))
 
 
 @program

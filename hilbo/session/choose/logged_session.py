@@ -36,10 +36,7 @@ class LoggedSession:
     def open(cls, folder: str | os.PathLike, study: Study, header: Header) -> "LoggedSession":
         """Begin a session, or go on with the one of this participant and label. Raises InputError."""
         path = Path(folder) / log_name(header)
-        if not begun(path):
-            log = EventLog.create(path, study.file, header)
-            return cls(log, LiveChooser(log.state))
-        log = EventLog.resume(path, study.file)
+        log = EventLog.resume(path, study.file) if begun(path) else EventLog.create(path, study.file, header)
         if log.state.header != msgspec.structs.replace(header, schema=log.state.header.schema):
             log.close()
             raise InputError(f"{path}: was begun with another seed, plan or sets; give those, or another label.")

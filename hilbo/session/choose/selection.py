@@ -26,7 +26,7 @@ from hilbo.search.space_lattice import lattice_of
 from hilbo.study.config import Inference, Study
 from hilbo.study.file.schema import Selection
 
-__all__ = ["Choosing", "Design", "design", "next_point", "point_after", "point_apart"]
+__all__ = ["Choosing", "Design", "design", "next_point", "point_after", "point_away_from"]
 
 _STARTS = 4  # of the polishing, on the lattice
 _GAIN = 1e-7  # of the prior's sd, of a score in units of f: less is no reason to polish on
@@ -94,19 +94,19 @@ def point_after(
     allowed = None
     if distance:
         points, usable = _searched(plan, _JOINT_CANDIDATES if thompson else None)
-        allowed = _apart_from(choosing.gp.kernel.levels, posterior.trials, points, usable, distance)
+        allowed = _keeps_distance(choosing.gp.kernel.levels, posterior.trials, points, usable, distance)
     if thompson:
         return _thompson_point(posterior, plan, trial, allowed)
     return _highest(choosing, plan, posterior, _score(choosing, posterior, weight), allowed).x
 
 
-def point_apart(
-    study: Study, plan: Design, posterior: Posterior, excluded: Float[Array, "k d"], apart: float
+def point_away_from(
+    study: Study, plan: Design, posterior: Posterior, excluded: Float[Array, "k d"], distance: float
 ) -> Float[Array, " d"]:
-    """The highest UCB (d,) at least `apart` from the points `excluded`, all in the unit cube; traceable."""
+    """The highest UCB (d,) at least `distance` from the points `excluded`, all in the unit cube; traceable."""
 
     def allowed(x):
-        return jnp.all(jnp.sum(differences(study.gp.kernel.levels, excluded, x[None, :]) ** 2, axis=1) >= apart**2)
+        return jnp.all(jnp.sum(differences(study.gp.kernel.levels, excluded, x[None, :]) ** 2, axis=1) >= distance**2)
 
     return _highest(Choosing.of(study), plan, posterior, acquisition.UCB(study.file.selection.weight), allowed).x
 
@@ -158,7 +158,7 @@ def _searched(plan: Design, count: int | None) -> tuple[Float[Array, "m d"], Boo
     return points, jnp.ones(len(points), bool)
 
 
-def _apart_from(
+def _keeps_distance(
     levels: tuple[int, ...],
     trials: Trials,
     points: Float[Array, "m d"],

@@ -113,8 +113,7 @@ class Step:
 
     @functools.cached_property
     def _layout(self) -> "_Layout":
-        leaves, structure = jax.tree.flatten(_posterior_shapes(self._choosing))
-        return _Layout(structure, tuple(leaves))
+        return _Layout(_posterior_shapes(self._choosing))
 
     @functools.cached_property
     def _none_given(self) -> Float[Array, " p"]:
@@ -167,14 +166,13 @@ class _Query(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """How a posterior's trials and latent values lie in a vector."""
+    """How a posterior's trials and latent values, of these `shapes`, lie in a vector."""
 
-    structure: Any
-    leaves: tuple[jax.ShapeDtypeStruct, ...]
+    shapes: Any
 
     @property
     def size(self) -> int:
-        return sum(math.prod(leaf.shape) for leaf in self.leaves)
+        return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(self.shapes))
 
     def vector(self, posterior: Posterior) -> Float[np.ndarray, " p"]:
         """A posterior's numbers, on the host."""
@@ -182,12 +180,13 @@ class _Layout(NamedTuple):
 
     def tree(self, vector: Any) -> Any:
         """Trials and latent values from a vector (p,) of NumPy or JAX."""
-        ends = np.cumsum([math.prod(leaf.shape) for leaf in self.leaves])
+        leaves, structure = jax.tree.flatten(self.shapes)
+        ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])
         parts = [
             vector[end - math.prod(leaf.shape) : end].reshape(leaf.shape).astype(leaf.dtype)
-            for leaf, end in zip(self.leaves, ends.tolist(), strict=True)
+            for leaf, end in zip(leaves, ends.tolist(), strict=True)
         ]
-        return jax.tree.unflatten(self.structure, parts)
+        return jax.tree.unflatten(structure, parts)
 
 
 def _step(
@@ -195,8 +194,7 @@ def _step(
 ) -> Float[Array, " r"]:
     """The next point in physical units and, behind it, the posterior's numbers."""
     query = _Query.of(numbers, choosing.selection.trials)
-    leaves, structure = jax.tree.flatten(_shapes(choosing))
-    layout = _Layout(structure, tuple(leaves))
+    layout = _Layout(_shapes(choosing))
     trials, latent = jax.lax.cond(query.given, lambda: layout.tree(packed), lambda: _fitted(choosing, query))
     point = point_after(choosing, plan, Posterior(choosing.gp, trials, latent), query.count, query.weight)
     parts = [choosing.space.to_physical(point), *jax.tree.leaves((trials, latent))]

@@ -73,15 +73,15 @@ def warm_point(
     warm: WarmStart,
     posterior: Posterior,
     excluded: Float[Array, "k d"] | None = None,
-    apart: float = 0.0,
+    distance: float = 0.0,
 ) -> Float[Array, " d"]:
-    """The candidate (d,) to ask after a participant's answers, `apart` or farther from the `excluded`; traceable."""
+    """The candidate (d,) to ask after a participant's answers, `distance` or farther from the `excluded`; traceable."""
     mean, variance = informed(study, warm, posterior)
     score = mean + study.file.selection.weight * jnp.sqrt(variance)
     if excluded is not None:
         away = differences(study.gp.kernel.levels, warm.points[:, None, :], excluded[None, :, :])
-        distance = jnp.sum(away**2, axis=2)
-        score = jnp.where(jnp.all(distance >= apart**2, axis=1), score, -jnp.inf)
+        squared = jnp.sum(away**2, axis=2)
+        score = jnp.where(jnp.all(squared >= distance**2, axis=1), score, -jnp.inf)
     return warm.points[jnp.argmax(score)]
 
 

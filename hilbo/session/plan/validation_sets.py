@@ -96,10 +96,9 @@ def _named(study, unit, prefix) -> NamedSets:
 
 def _check_same(study, result, x):
     stated = check_values(result.optimum.parameters, study.space.parameters, "plan", "the optimum")
-    values = np.array([stated[name] for name in study.space.names])
-    apart = np.max(np.abs(np.asarray(study.space.to_unit(values)) - x))
-    if apart > _SAME:
+    distance = np.max(np.abs(Rendering.of(study.space, stated).unit - x))
+    if distance > _SAME:
         raise InputError(
-            f"plan: the optimum of these answers is {apart:.2g} of the ranges away from that of result.json; give the"
-            " trials that it was made from."
+            f"plan: the optimum of these answers is {distance:.2g} of the ranges away from that of result.json; give"
+            " the trials that it was made from."
         )
