@@ -1,4 +1,4 @@
-"""The device of a session, in a thread of its own: one job after the other, its state looked at ten times a second.
+"""Rig of a haptic device: a thread that runs jobs on the device one after the other and polls it ten times a second.
 
 Nothing here knows of trials or answers. A job gives a `Future`; whatever the device or the line does wrong is the job's
 `DeviceError`, and the snapshot that everybody may read says `lost` with the sentence; so it does of a device that has
@@ -66,11 +66,11 @@ class DeviceRig:
 
     @property
     def words(self) -> str:
-        """Where it is, and its damping."""
+        """Port of the device, and its damping."""
         return f"{self.device.link.name}, damping {self.device.device.damping_N_s_per_m:.3g} N·s/m"
 
     async def prepare(self, showing: Showing) -> Loaded:
-        """The set in force once nobody presses."""
+        """Put the set of a rendering in force, once the handle is out of contact."""
         wanted = self._wanted(showing)
         while (loaded := await asyncio.wrap_future(self.do(lambda device: self._load(device, wanted)))) is None:
             await asyncio.sleep(_NEAR)
@@ -92,10 +92,10 @@ class DeviceRig:
         return self._counter.counts((trial, presentation))
 
     async def blank(self) -> None:
-        """What is in force pushes the handle back when the hand leaves it, and stays."""
+        """Do nothing: the set in force stays, and returns the handle when the hand leaves it."""
 
     async def rest(self) -> None:
-        """The renderer rests; told even if this is left."""
+        """Stop the device; the order is sent even if the caller is cancelled."""
         stopped = asyncio.wrap_future(self.do(self._stop))
         stopped.add_done_callback(_looked_at)
         await asyncio.shield(stopped)
@@ -124,7 +124,7 @@ class DeviceRig:
             self._stopping = 0
 
     def hang_up(self) -> None:
-        """Nobody waits for a device."""
+        """Do nothing: no client waits for a device."""
 
     def close(self) -> None:
         """Stop the device and let go of it."""
@@ -212,7 +212,7 @@ class DeviceRig:
             self._see(self.snapshot._replace(lost=str(error), state="LOST", contact=False))
 
     def _again(self) -> None:
-        """A device that is back is stopped, and has no set that anybody should count on."""
+        """Reconnect a lost device, which is then stopped and without a set."""
         try:
             if self.device.simulator is not None and not self.device.simulator.alive():
                 with contextlib.suppress(DeviceError):
@@ -252,13 +252,13 @@ class DeviceRig:
 
 
 def _reason(status: Status) -> str:
-    """Why it holds or was stopped, in words."""
+    """Reason of a hold or stop, in words."""
     if status.hold_reason == HoldReason.SWITCH and not status.flags & DeviceFlag.STOP_OPEN:
         return "the hardware stop was open"  # it is closed again, and can be cleared
     return held_because(status.hold_reason)
 
 
 def _looked_at(done: asyncio.Future) -> None:
-    """Its exception counts as seen, also where nobody waits for it."""
+    """Retrieve the exception of a future that may not be awaited."""
     if not done.cancelled():
         done.exception()

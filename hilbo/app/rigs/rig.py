@@ -83,11 +83,11 @@ class Rig(Protocol):
         ...
 
     async def blank(self) -> None:
-        """All steps of a trial are over."""
+        """End the presentation of a trial, after its last step."""
         ...
 
     async def rest(self) -> None:
-        """Nobody is to feel or see anything."""
+        """Present nothing from now on."""
         ...
 
     async def estop(self) -> None:
@@ -95,11 +95,11 @@ class Rig(Protocol):
         ...
 
     async def clear(self) -> None:
-        """Go on after a hold or a stop."""
+        """Leave a hold or a stop."""
         ...
 
     def hang_up(self) -> None:
-        """The server ends: let nobody wait."""
+        """Answer all waiting requests, since the server ends."""
         ...
 
     def close(self) -> None:

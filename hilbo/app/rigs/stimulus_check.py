@@ -1,5 +1,5 @@
-"""Is a program ready to present? It is asked for renderings and stopped in them, by the server and rig of a session,
-without a participant, an experimenter or a log.
+"""Check of a stimulus program: renderings are presented and stopped by the server and rig of a session, without a
+participant, an experimenter or a log.
 """
 
 import asyncio
@@ -46,10 +46,10 @@ class StimulusCheck:
         self._task = asyncio.get_running_loop().create_task(self._measure())
 
     async def open(self) -> None:
-        """Nothing is to be opened."""
+        """Do nothing: there is no device to open."""
 
     async def close(self) -> None:
-        """Measure no more."""
+        """Cancel the measurement."""
         if self._task is not None:
             self._task.cancel()
 
@@ -58,7 +58,7 @@ class StimulusCheck:
         return self._study.session.text(key)
 
     def hang_up(self) -> None:
-        """Let nobody wait."""
+        """Answer all waiting requests."""
         self.rig.hang_up()
 
     async def _measure(self) -> None:
@@ -78,7 +78,7 @@ class StimulusCheck:
         self._done()
 
     async def _joined(self) -> None:
-        """The program is there, and has stopped once. Raises RuntimeError where nobody comes."""
+        """Wait until a program has joined and has stopped once. Raises `RuntimeError` after `patience` s."""
         end = time.monotonic() + self._patience
         while self.rig.snapshot.lost:
             if time.monotonic() > end:
@@ -86,7 +86,7 @@ class StimulusCheck:
             await asyncio.sleep(0.02)
 
     def _middle(self, number: int) -> Showing:
-        """The middle of all ranges."""
+        """The rendering in the middle of all ranges."""
         middles = ((p, (p.low + p.high) / 2) for p in self._study.space.parameters)
         values = {p.name: float(round(middle)) if p.discrete else middle for p, middle in middles}
         return Showing(number + 1, 1, 0, "a", values, None)

@@ -80,7 +80,7 @@ class StimulusRig:
 
     @property
     def words(self) -> str:
-        """What the program says of itself."""
+        """Name, version and force of the program, in words."""
         said = self._hello
         if self.role == "preparer":
             return "a person presents, by hand"
@@ -112,7 +112,7 @@ class StimulusRig:
         return {"run": self._run, **limits, **study, **self._current_order()}
 
     async def free(self) -> bool:
-        """Whether nobody presents: no program was heard for as long as it may be silent, which is waited for."""
+        """Whether no program presents; waits at most as long as a program may be silent."""
         end = time.monotonic() + min(self._table.silence + _TURN, _WAIT)
         while self._run and (left := end - time.monotonic()) > 0:
             await self._wait_for(self._moved, left)
@@ -139,7 +139,7 @@ class StimulusRig:
         return self._current_order()
 
     def _apply(self, report: Report) -> None:
-        """What a report says of the present order, and of contact."""
+        """Apply a report: contact, and the state of the current order. Raises `OverError`."""
         order = self.order
         if report.order > order.number:
             raise OverError(f"There is no order {report.order} yet; the newest is {order.number}.")
@@ -183,7 +183,7 @@ class StimulusRig:
             self._confirmation.set_result(Loaded({"values": values, "took_s": took, **self._program_facts()}, took))
 
     def _neutral(self, order: Order) -> None:
-        """It shows nothing: the order that says so is done, and a stop is acknowledged."""
+        """Record that the program presents nothing, which acknowledges a stop."""
         self._cancel_timer("neutral")
         if order.do == "present":
             return
@@ -206,13 +206,13 @@ class StimulusRig:
     # What the session wants.
 
     async def prepare(self, showing: Showing) -> None:
-        """A program is told when it is to present, and not before."""
+        """Do nothing: a program is ordered when it is to present, and not before."""
 
     def telemetry(self, trial: int, presentation: int) -> None:
-        """A program sends no telemetry."""
+        """None: a program sends no telemetry."""
 
     async def show(self, showing: Showing) -> Loaded | None:
-        """Ordered as soon as nobody touches it, where it moves something, and confirmed in time."""
+        """Order a step, for a program with force once nothing touches it, and wait for its confirmation."""
         self._check_present()
         if showing.show == "neutral":
             await self.blank()
@@ -237,14 +237,14 @@ class StimulusRig:
         return None if showing.values is None else confirmed
 
     async def blank(self) -> None:
-        """Nothing is shown while somebody answers."""
+        """Order the neutral state during the response."""
         if self.order.do == "present":
             self._order("neutral")
 
     rest = blank
 
     async def estop(self) -> None:
-        """The stop, and its acknowledgement. Raises RuntimeError where that does not come."""
+        """Order a stop and wait for its acknowledgement. Raises `RuntimeError` if that does not come in time."""
         if self.snapshot.lost:
             raise RuntimeError(self.snapshot.lost)
         assert self._hello is not None
@@ -262,7 +262,7 @@ class StimulusRig:
             await self._wait_for(self._moved, end - time.monotonic())
 
     async def clear(self) -> None:
-        """Go on after a stop that was acknowledged. Raises RuntimeError."""
+        """Leave an acknowledged stop. Raises `RuntimeError` before the acknowledgement."""
         self._check_present()
         if self.snapshot.state == "ESTOP":
             if self._stop_s is None:
@@ -271,19 +271,19 @@ class StimulusRig:
             self._order("neutral")
 
     def hang_up(self) -> None:
-        """Whoever waits for an order is told to be neutral."""
+        """Order the neutral state, and cancel all timers."""
         self._ended = True
         self._order("neutral")
         for what in list(self._timers):
             self._cancel_timer(what)
 
     def close(self) -> None:
-        """The server ends; a program that hears nothing any more goes neutral by itself."""
+        """Do nothing: a program that gets no answers goes neutral by itself."""
 
     # How long things may take.
 
     def _order(self, do: str, showing: Showing | None = None, trial: str = "") -> None:
-        """A new order, and who moves something says in time that it is neutral."""
+        """Give the next order; a program with force must report the neutral state in time."""
         if self.order.do != "present" or do != "present":
             self._cancel_timer("neutral")
         self._replace_order(Order(self.order.number + 1, do, showing, trial))
@@ -298,7 +298,7 @@ class StimulusRig:
         self._start_timer("silence", self._table.silence, words)
 
     def _start_timer(self, what: str, seconds: float, words: str) -> None:
-        """The program is lost unless something comes before the time is over."""
+        """Drop the program after `seconds` unless the timer `what` is cancelled before."""
         self._cancel_timer(what)
         if not self._ended:
             self._timers[what] = asyncio.get_running_loop().call_later(seconds, self._drop_program, words)
@@ -309,7 +309,7 @@ class StimulusRig:
             timer.cancel()
 
     def _drop_program(self, words: str) -> None:
-        """The program is not believed any more, and has to say hello again."""
+        """Drop the program, which must say hello again, for the reason `words`."""
         for what in list(self._timers):
             self._cancel_timer(what)
         self._run = ""
@@ -320,12 +320,12 @@ class StimulusRig:
         )
 
     def _abort_confirmation(self, words: str) -> None:
-        """Nobody waits any more for a confirmation, which is no fault of the trial."""
+        """Fail the pending confirmation without voiding the trial."""
         if self._confirmation is not None and not self._confirmation.done():
             self._confirmation.set_exception(RuntimeError(words))
 
     def _replace_order(self, order: Order) -> None:
-        """Whoever waits for an order has this one."""
+        """Make this the current order, and wake requests that wait for one."""
         self.order, self._since = order, time.monotonic()
         self._news.set()
         self._news = asyncio.Event()
@@ -352,7 +352,7 @@ class StimulusRig:
         return self._hello is not None and self._hello.force
 
     def _current_order(self) -> dict[str, Any]:
-        """The order that stands, as it is sent."""
+        """The current order as a message."""
         return as_sent(self.order, self._study, self._tag)
 
     def _program_facts(self) -> dict[str, Any]:

@@ -177,7 +177,7 @@ def _in_its_digits(parameter: Parameter, value: Any) -> float:
 
 
 def _read_only(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The same arrays, which nobody can change: a state is a record, and its proposal depends on them."""
+    """The same arrays, read-only: a state is immutable, and its proposal depends on them."""
     for array in arrays:
         array.flags.writeable = False
     return arrays

@@ -1,4 +1,4 @@
-"""What a live session shows next, found before it is asked for: no fit runs after an answer.
+"""Look-ahead of a live session: the next rendering is found before it is needed, so that no fit runs after an answer.
 
 `LiveChooser.lookahead(state)` finds the next rendering for each answer that may come; `choose` then only looks it up.
 Each answer's posterior is fitted once, by the step that chooses (`hilbo.session.choose.step`), and kept: it explains
@@ -33,9 +33,9 @@ _KEPT = 64  # posteriors, the newest: those of the present, of what may follow, 
 
 
 class LiveChooser:
-    """Finds and remembers the renderings of one session. May be used from several threads.
+    """Chooser of the renderings of one session, with a cache of choices and posteriors. Thread-safe.
 
-    `fits` counts the fits that were computed, `looked_up` the choices that were there when they were asked for.
+    `fits` counts the fits that were computed, `looked_up` the choices that were in the cache when needed.
     Raises `InputError` for maps of a warm start that do not fit the session's header.
     """
 
@@ -150,12 +150,12 @@ class LiveChooser:
 
 
 def warm_start_sources(warm: Mapping[str | None, WarmStart]) -> str | None:
-    """What a header says of a session's warm starts, one for each material; None where there are none."""
+    """Warm starts of a session as its header holds them, one for each material; None if there are none."""
     return ",".join(f"{name or ''}={warm[name].source}" for name in sorted(warm, key=str)) or None
 
 
 def _from(sources: str | None) -> str:
-    """In words what a header says of warm starts."""
+    """Warm starts of a header in words."""
     if sources is None:
         return "without --warm-start"
     maps = [source.rpartition("=")[::2] for source in sources.split(",")]

@@ -1,4 +1,4 @@
-"""How far a session has come: for the experimenter, who may stop earlier or go on; nothing stops by itself.
+"""Progress of a session for the experimenter, who may stop earlier or go on; nothing stops by itself.
 
 `trust` looks at the answers of an optimisation through the participant's posterior:
 
@@ -29,7 +29,7 @@ __all__ = ["Consistency", "Trust", "consistency", "trust", "trust_of"]
 
 @dataclass(frozen=True)
 class Trust:
-    """What the answers so far say of the best rendering (physical units)."""
+    """Estimate of the best rendering after the answers so far (physical units)."""
 
     best: dict[str, float]
     top: float

@@ -1,4 +1,4 @@
-"""What is asked next: pure functions of the study, what a seed decides, and the answers; traceable.
+"""Selection of the next point: pure, traceable functions of study, seed and answers.
 
 The first trials are a Latin hypercube inside the feasible set, the following maximise the acquisition function over a
 low-discrepancy candidate set or a lattice and are polished (paper, algorithm 1).
@@ -34,8 +34,10 @@ _JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in the
 
 
 class Choosing(eqx.Module):
-    """Of a study, what its choices depend on: studies that differ in anything else are asked the same points, and share
-    their programs. Whoever chooses by it gives the weight of the standard deviation each time."""
+    """The part of a study that its choices depend on: studies that differ in the rest share points and programs.
+
+    The weight of the standard deviation is no part of it, but an argument of `point_after`.
+    """
 
     gp: OrdinalGP
     space: SearchSpace
@@ -50,7 +52,7 @@ class Choosing(eqx.Module):
 
 
 class Design(eqx.Module):
-    """What a seed decides in advance: where the first trials are, and among which points the others are searched.
+    """Seeded part of a session: the first points (s, d), and the points among which the acquisition is maximised.
 
     The latter are a lattice in two or three dimensions, whose nodes are products and cost a hundredth of other points;
     else, for constraints, whole numbers and levels, and for Thompson's draws, `candidates`.

@@ -1,4 +1,4 @@
-"""What is compiled once for a session: from answers to their posterior and the next point, one fit for both.
+"""The compiled step of a session: from answers to their posterior and the next point, by one fit.
 
 Sessions and live sessions run this very program, so that they ask the same points bit for bit. It takes a posterior
 that is known already in place of answers, and then only searches: the largest posterior mean needs no second fit.
@@ -93,14 +93,14 @@ class Step:
 
     def _physical(self, points: Any) -> Float[np.ndarray, "*n d"]:
         """Points (..., d) of a program as float64, which tables and devices have, within the parameters' ranges: where
-        JAX computes with 32 bits, its number for an end may be beyond that end. Nobody may write to them."""
+        JAX computes with 32 bits, its number for an end may be beyond that end. Read-only."""
         numbers = np.asarray(points).astype(np.float64)
         numbers = np.where(numbers < self._low, self._low, np.where(numbers > self._high, self._high, numbers))
         numbers.flags.writeable = False
         return numbers
 
     def warm(self) -> None:
-        """Compile what chooses."""
+        """Compile the step."""
         self._run(np.zeros((0, len(self.names))), ())
 
     def _run(self, points, answers) -> Float[np.ndarray, " k"]:
@@ -145,7 +145,7 @@ class _Bound(NamedTuple):
 
 
 class _Query(NamedTuple):
-    """What a step is asked: how many answers there are, the weight of the sd, and whether a posterior is given."""
+    """Input of a step: number of answers, weight of the sd, whether a posterior is given, categories and points."""
 
     count: Int[Array, ""]
     weight: Float[Array, ""]
@@ -203,8 +203,8 @@ def _step(
 
 @program
 def _posterior_shapes(choosing: Choosing) -> Any:
-    """Of trials and latent values, as a step finds them. A program, though it computes nothing: whoever keeps programs
-    traces no fit to know it."""
+    """Shapes of trials and latent values as a step returns them. A program, though it computes nothing, so that kept
+    programs make tracing a fit unnecessary."""
     return _shapes(choosing)
 
 

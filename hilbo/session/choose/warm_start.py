@@ -1,4 +1,4 @@
-"""Beginning a new participant's session from the population's map: which renderings are chosen, and nothing else.
+"""Warm start of a new participant's session from the population's map; it affects only the choice of renderings.
 
 Somebody new is taken for the population g and a deviation h of their own, f = g + h, whose variance is the share 1 - p
 of the prior's, k. What is known of f at a point before their first answer is then

@@ -61,7 +61,7 @@ def coded(name: str, codes: Mapping[str, str]) -> str:
 
 
 def _person(name: str) -> str:
-    """Who a set is named after; nobody for sets of the population."""
+    """Participant in the name of a set; "" for sets of the population."""
     if name.startswith(OWN):
         return name.removeprefix(OWN)
     before, _, role = name.rpartition(" ")
