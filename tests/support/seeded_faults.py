@@ -57,8 +57,8 @@ FAULTS = (
     Fault(
         "factor under the root of the largest passive K1",
         "hilbo/passivity.py",
-        "half**2 + 4 * excess",
-        "half**2 + 2 * excess",
+        "half**2 + 4 * A * Y",
+        "half**2 + 2 * A * Y",
         "tests/test_passivity.py",
     ),
     Fault(
