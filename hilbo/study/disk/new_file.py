@@ -27,7 +27,6 @@ def new_file(path: Path, *, replace: bool, mode: int = _OWNER_ONLY) -> Iterator[
     followed. Without `replace` raises FileExistsError where something has the name by then. Raises OSError."""
     remove_unfinished(path.parent)
     unfinished, file = _begun(path.parent)
-    closed = False
     try:
         yield unfinished
         if mode != _OWNER_ONLY:
@@ -35,14 +34,14 @@ def new_file(path: Path, *, replace: bool, mode: int = _OWNER_ONLY) -> Iterator[
         os.fsync(file)
         if os.name == "nt":  # which renames no open file
             os.close(file)
-            closed = True
+            file = -1
         _put(unfinished, path, replace)
         sync_folder(path.parent)
     finally:
+        if file >= 0:
+            os.close(file)
         with contextlib.suppress(OSError):
             unfinished.unlink(missing_ok=True)
-        if not closed:
-            os.close(file)
 
 
 def write_file(path: Path, content: str | bytes, *, replace: bool, mode: int = _OWNER_ONLY) -> None:

@@ -38,10 +38,13 @@ def new_folder(out: Path, check: Callable[[], None]) -> Iterator[Path]:
         yield made
         _seal(made)
         with locked_folder(out.parent, in_withdrawal=True):  # a withdrawal refuses until this one is done
+            os.close(filling)
+            filling = -1
             (made / LOCK).unlink()
             _publish(made, out, check)
     finally:
-        os.close(filling)
+        if filling >= 0:
+            os.close(filling)
         shutil.rmtree(made, ignore_errors=True)
 
 
