@@ -144,7 +144,9 @@ def test_an_exported_folder_can_be_replaced_afterwards(folder, capsys, monkeypat
     with results(folder / "tables", force=False) as made:
         (made / "dataset_description.json").write_text("{}")
         (made / "t_data.csv").write_text("participant,trial\nP01,1\nP02,1\n")
-    delete(capsys, monkeypatch, folder, "P02")
+        (made / "trials.nc").write_bytes(b"\x89HDF\r\n\x1a\nP02")
+    err = delete(capsys, monkeypatch, folder, "P02")
+    assert "trials.nc: 1 removed" in err and "trials.nc: LEFT" not in err and "hilbo export --force\n" in err
     assert (folder / "tables" / "t_data.csv").read_text() == "participant,trial\nP01,1\n"
     with results(folder / "tables", force=True) as made:
         (made / "new.csv").write_text("")

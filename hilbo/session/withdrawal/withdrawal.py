@@ -95,11 +95,11 @@ def delete_participant(folder: str | os.PathLike, participant: str, done: Withdr
                 raise InputError(
                     f'{root}: nothing of participant "{participant}" was removed{also}; check id and folder.'
                 )
+            _write_journal(root, planned)
         except BaseException:
             if not before.begun:
                 (root / JOURNAL).unlink()
             raise
-        _write_journal(root, planned)
         refused = _carry_out(root, planned, done)
         done.left |= left_below(root, participant) | refused
         if refused:
