@@ -90,9 +90,7 @@ def start(y, bins, ard):
 
 @functools.partial(jax.jit, static_argnames="inference")
 def predict(gp, trials, x, inference):
-    learned = maximise_evidence(
-        gp, trials, ("theta", "noise", "thresholds"), starts=2, max_steps=60, inference=inference
-    )
+    learned = maximise_evidence(gp, trials, ("theta", "noise", "thresholds"), starts=2, inference=inference)
     posterior = fit(learned.gp, trials, inference=inference, throw=False)
     return posterior.class_probabilities(x), learned.steps
 

@@ -55,12 +55,7 @@ class Evidence(eqx.Module):
 
 
 def combine(
-    means: Numbers,
-    variances: Numbers,
-    prior_variance: Numbers,
-    *,
-    mask: Numbers | None = None,
-    throw: bool = True,
+    means: Numbers, variances: Numbers, prior_variance: Numbers, *, mask: Numbers | None = None, throw: bool = True
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Population mean and variance (m,) from participants' posterior means and variances at the same m points.
 
@@ -80,12 +75,7 @@ def combine(
 
 
 def combine_explained(
-    means: Numbers,
-    explained: Numbers,
-    prior_variance: Numbers,
-    *,
-    mask: Numbers | None = None,
-    throw: bool = True,
+    means: Numbers, explained: Numbers, prior_variance: Numbers, *, mask: Numbers | None = None, throw: bool = True
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Population mean and variance as [`combine`][], from the variances e_j = k - sigma_j^2 explained, (M, m).
 
@@ -142,10 +132,7 @@ def _averaged(means: Float[Array, "M m"], variances: Float[Array, "M m"], presen
 
 @_one_program
 def _merged(
-    means: Float[Array, "M m"],
-    explained: Float[Array, "M m"],
-    prior: Float[Array, " m"],
-    present: Bool[Array, " M"],
+    means: Float[Array, "M m"], explained: Float[Array, "M m"], prior: Float[Array, " m"], present: Bool[Array, " M"]
 ) -> tuple[_Map, Bool[Array, " m"]]:
     """Population map of the committee machine, NaN at invalid points; and the mask of invalid points."""
     means, explained = _present_rows(present, means), _present_rows(present, explained)

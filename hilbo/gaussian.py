@@ -20,6 +20,9 @@ from hilbo.numerics.shown import has_values, shown
 __all__ = [
     "Certificate",
     "GaussianPosterior",
+    "Matrix",
+    "Scalar",
+    "Vector",
     "certify",
     "evidence_error",
     "evidence_known",
@@ -39,6 +42,11 @@ def __dir__() -> list[str]:
     return __all__
 
 
+Scalar = Float[Array, ""]
+Vector = Float[Array, " n"]
+"""One number for each latent value."""
+Matrix = Float[Array, "n n"]
+"""A number for each pair of latent values."""
 Terms = TypeVar("Terms")
 _NATS, _SHARE = 0.02, 1e-5  # absolute and relative tolerance of a log evidence
 _ROUNDING_FACTORS = np.array([3.0, 5.0, 7.0, 11.0])  # factors to multiply and divide by, to provoke rounding
@@ -47,25 +55,25 @@ _ROUNDING_FACTORS = np.array([3.0, 5.0, 7.0, 11.0])  # factors to multiply and d
 class Certificate(eqx.Module):
     """Convergence diagnostics of a fit; every number is measured."""
 
-    residual: Float[Array, ""]
+    residual: Scalar
     """|R' grad l - v| at the mode: a bound on its distance from the exact mode, in prior standard deviations."""
-    tolerance: Float[Array, ""]
+    tolerance: Scalar
     """Tolerance of the residual: eps^(2/3), or the rounding error of the residual itself if that is larger."""
     iterations: Int[Array, ""]
     """Newton steps taken, rejected ones included."""
-    jitter: Float[Array, ""]
+    jitter: Scalar
     """Largest change of the prior covariance by its square root, over the largest prior variance; nothing is added."""
-    condition: Float[Array, ""]
+    condition: Scalar
     """Upper bound on the condition number of I + W^(1/2) K W^(1/2), the only matrix that is factorised."""
-    smallest_variance: Float[Array, ""]
+    smallest_variance: Scalar
     """Smallest posterior variance among the eta's with informative data."""
-    variance_resolution: Float[Array, ""]
+    variance_resolution: Scalar
     """Rounding error to expect in a posterior variance: eps * largest prior variance * sqrt(n)."""
-    evidence_error: Float[Array, ""]
+    evidence_error: Scalar
     """Error of the log evidence due to the distance from the exact mode and the rounding of K a, to first order."""
-    evidence_tolerance: Float[Array, ""]
+    evidence_tolerance: Scalar
     """Tolerance of the evidence error: 0.02 + eps^(1/2) |log evidence|."""
-    evidence_rounding: Float[Array, ""]
+    evidence_rounding: Scalar
     """Error of the log evidence due to the rounding of K."""
     converged: Bool[Array, ""]
     """residual <= tolerance, evidence_error <= evidence_tolerance, evidence_error + evidence_rounding <= 0.02 +
@@ -78,14 +86,14 @@ class Certificate(eqx.Module):
 class GaussianPosterior(eqx.Module):
     """Gaussian approximation N(mode, K - K C K) of p(eta | data), C = (K + 1/W)^-1."""
 
-    mode: Float[Array, " n"]
-    weights: Float[Array, " n"]
+    mode: Vector
+    weights: Vector
     """a = grad l at the mode; the posterior mean of any jointly Gaussian f* is k*'a."""
-    factor: Float[Array, "n n"]
+    factor: Matrix
     """V with V'V = C, for values; its derivative is not defined where W = 0, so it carries none."""
-    inverse: Float[Array, "n n"]
+    inverse: Matrix
     """C, for derivatives."""
-    log_evidence: Float[Array, ""]
+    log_evidence: Scalar
     certificate: Certificate
 
     def __repr__(self) -> str:
@@ -95,13 +103,13 @@ class GaussianPosterior(eqx.Module):
 
 
 def certify(
-    covariance: Float[Array, "n n"],
-    mode: Float[Array, " n"],
-    weights: Float[Array, " n"],
-    curvature: Float[Array, " n"],
-    factor: Float[Array, "n n"],
-    curvature_at: Callable[[Float[Array, " n"]], Float[Array, " n"]],
-    log_evidence: Float[Array, ""],
+    covariance: Matrix,
+    mode: Vector,
+    weights: Vector,
+    curvature: Vector,
+    factor: Matrix,
+    curvature_at: Callable[[Vector], Vector],
+    log_evidence: Scalar,
     **search: Any,
 ) -> Certificate:
     """Compute the certificate of the posterior with these `weights` a, `curvature` W and `factor` V.
@@ -133,13 +141,13 @@ def certify(
 
 
 def evidence_error(
-    covariance: Float[Array, "n n"],
-    mode: Float[Array, " n"],
-    weights: Float[Array, " n"],
-    curvature: Float[Array, " n"],
-    posterior: tuple[Float[Array, " n"], Callable[[Float[Array, "n k"]], Float[Array, "n k"]]],
-    curvature_at: Callable[[Float[Array, " n"]], Float[Array, " n"]],
-) -> Float[Array, ""]:
+    covariance: Matrix,
+    mode: Vector,
+    weights: Vector,
+    curvature: Vector,
+    posterior: tuple[Vector, Callable[[Float[Array, "n k"]], Float[Array, "n k"]]],
+    curvature_at: Callable[[Vector], Vector],
+) -> Scalar:
     """Error of Laplace's log evidence due to an inexact `mode`, with `weights` a and `curvature` W there.
 
     `posterior`: variances, and a function that multiplies by C.
@@ -159,7 +167,7 @@ def evidence_error(
     return 0.5 * (jnp.sum(curvature * mode_error**2) + jnp.sum(jnp.abs(variance) * change))
 
 
-def evidence_rounding(covariance: Float[Array, "n n"], weights: Float[Array, "k n"]) -> Float[Array, ""]:
+def evidence_rounding(covariance: Matrix, weights: Float[Array, "k n"]) -> Scalar:
     """Error in the sum of a'K a / 2 over the rows a of `weights` due to the rounding of K.
 
     Estimated by rounding K once more in several ways, and taking the differences. Equal elements of K are rounded
@@ -171,7 +179,7 @@ def evidence_rounding(covariance: Float[Array, "n n"], weights: Float[Array, "k 
     return 0.5 * jnp.linalg.norm(jnp.einsum("ki,wij,kj->w", weights, rounded, weights))
 
 
-def evidence_known(value: Float[Array, ""], error: Float[Array, ""], rounding: Float[Array, ""]) -> Bool[Array, ""]:
+def evidence_known(value: Scalar, error: Scalar, rounding: Scalar) -> Bool[Array, ""]:
     """Whether a log evidence with this `error` and `rounding` is finite and accurate enough (see [`Certificate`][]).
 
     All are scalars, in nats.
@@ -181,12 +189,12 @@ def evidence_known(value: Float[Array, ""], error: Float[Array, ""], rounding: F
     return jnp.isfinite(value) & (error <= evidence_tolerance(value)) & near
 
 
-def evidence_tolerance(log_evidence: Float[Array, ""]) -> Float[Array, ""]:
+def evidence_tolerance(log_evidence: Scalar) -> Scalar:
     """Tolerance of a log evidence: 0.02 + eps^(1/2) |log evidence|. Scalars, in nats."""
     return _NATS + jnp.finfo(log_evidence.dtype).eps ** 0.5 * jnp.abs(log_evidence)
 
 
-def shortfall(certificate: Any, log_evidence: Float[Array, ""]) -> str:
+def shortfall(certificate: Any, log_evidence: Scalar) -> str:
     """Message on why a certificate is not converged, with possible remedies.
 
     `certificate` may be that of a sampled posterior.
@@ -224,7 +232,7 @@ def still(terms: Terms) -> Terms:
 
 @jax.custom_jvp
 def mean_and_explained(
-    weights: Float[Array, " n"], factor: Float[Array, "n n"], inverse: Float[Array, "n n"], cross: Float[Array, "n m"]
+    weights: Vector, factor: Matrix, inverse: Matrix, cross: Float[Array, "n m"]
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Posterior mean `k*'a` at m points, and the explained variance `k*'C k*`: prior minus posterior variance.
 
@@ -250,7 +258,7 @@ def _mean_and_explained_jvp(
     return mean_and_explained(*primals), (d_mean, d_explained)
 
 
-def square_root(covariance: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
+def square_root(covariance: Matrix) -> tuple[Matrix, Scalar]:
     """R with R R' = K, and the largest element of R R' - K.
 
     One Cholesky step removes the component common to all eta's, the largest part of a large K; the eigenvectors of the
@@ -267,9 +275,7 @@ def square_root(covariance: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], F
     return root, jnp.max(jnp.abs(root @ root.T - covariance))
 
 
-def factorise(
-    covariance: Float[Array, "n n"], curvature: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, "n n"]]:
+def factorise(covariance: Matrix, curvature: Vector) -> tuple[Vector, Matrix, Matrix]:
     """W^(1/2) as a vector, B = I + W^(1/2) K W^(1/2), and its Cholesky factor L.
 
     `covariance` (n, n), `curvature` (n,) -> (n,), (n, n), (n, n).
@@ -279,9 +285,7 @@ def factorise(
     return root, matrix, cholesky(matrix)
 
 
-def factor(
-    covariance: Float[Array, "n n"], curvature: Float[Array, " n"]
-) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
+def factor(covariance: Matrix, curvature: Vector) -> tuple[Matrix, Scalar]:
     """V = L^-1 W^(1/2) with B = L L', so V'V = C.
 
     And an upper bound on B's condition number (its eigenvalues are >= 1).
@@ -293,9 +297,7 @@ def factor(
 
 
 @jax.custom_jvp
-def inverse_and_log_determinant(
-    covariance: Float[Array, "n n"], curvature: Float[Array, " n"]
-) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
+def inverse_and_log_determinant(covariance: Matrix, curvature: Vector) -> tuple[Matrix, Scalar]:
     """C, and log|B| = log|I + K W|. `covariance` (n, n), `curvature` (n,) -> (n, n) and a scalar."""
     root, _, lower = factorise(covariance, curvature)
     factor = solve_lower(lower, jnp.diag(root))
@@ -305,7 +307,7 @@ def inverse_and_log_determinant(
 @inverse_and_log_determinant.defjvp
 def _inverse_and_log_determinant_jvp(
     primals: tuple[Array, ...], tangents: tuple[Array, ...]
-) -> tuple[tuple[Float[Array, "n n"], Float[Array, ""]], tuple[Float[Array, "n n"], Float[Array, ""]]]:
+) -> tuple[tuple[Matrix, Scalar], tuple[Matrix, Scalar]]:
     """With T = I - C K: dC = -C dK C + T dW T' and d log|B| = tr(C dK) + tr(K T dW); no 1/W, no W^(1/2)."""
     covariance, _ = primals
     d_covariance, d_curvature = tangents

@@ -341,10 +341,6 @@ class Renderer:
             self._buffer.wait(_POLL)
         return self._buffer.counts() != seen
 
-    def newest(self) -> Any:
-        """Newest telemetry message, for displays; None before the first."""
-        return self._buffer.newest
-
     def counts(self) -> Counts:
         """Counts of samples received, dropped by the device, and missing."""
         return self._buffer.counts()

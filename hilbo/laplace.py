@@ -24,10 +24,13 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Int, PyTree
 
 from hilbo.gaussian import (
     GaussianPosterior,
+    Matrix,
+    Scalar,
+    Vector,
     certify,
     factor,
     inverse_and_log_determinant,
@@ -43,7 +46,7 @@ def __dir__() -> list[str]:
     return __all__
 
 
-Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
+Terms = Callable[[Vector], tuple[Vector, Vector, Vector]]
 """Log-likelihood terms l_i(eta_i), their slopes l_i' and curvatures -l_i'' >= 0; [`Pointwise`][] derives the latter."""
 
 
@@ -53,9 +56,9 @@ _PLAIN_STEPS, _STEPS = 20, 200
 class Pointwise(eqx.Module):
     """Terms given by their values alone, (n,) -> (n,) elementwise; slopes and curvatures by differentiation."""
 
-    log_likelihood: Callable[[Float[Array, " n"]], Float[Array, " n"]]
+    log_likelihood: Callable[[Vector], Vector]
 
-    def __call__(self, eta: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+    def __call__(self, eta: Vector) -> tuple[Vector, Vector, Vector]:
         ones = jnp.ones_like(eta)  # the terms are independent: one tangent serves them all
 
         def value_and_slope(eta):
@@ -66,11 +69,7 @@ class Pointwise(eqx.Module):
 
 
 def laplace(
-    covariance: Float[Array, "n n"],
-    terms: Terms,
-    *,
-    start: Float[Array, " n"] | None = None,
-    max_steps: int = _STEPS,
+    covariance: Matrix, terms: Terms, *, start: Vector | None = None, max_steps: int = _STEPS
 ) -> GaussianPosterior:
     """Approximate p(eta | data) by a Gaussian at its mode.
 
@@ -112,15 +111,15 @@ def laplace(
 class Mode(NamedTuple):
     """Mode, its residual and tolerance, number of steps, and change of K by its square root."""
 
-    eta: Float[Array, " n"]
-    residual: Float[Array, ""]
-    tolerance: Float[Array, ""]
+    eta: Vector
+    residual: Scalar
+    tolerance: Scalar
     steps: Int[Array, ""]
-    changed: Float[Array, ""]
+    changed: Scalar
 
 
 @eqx.filter_custom_jvp
-def find_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
+def find_mode(terms: Terms, covariance: Matrix, start: Vector, max_steps: int) -> Mode:
     """Find the mode from weights `start`, or if that fails from 0.
 
     Under `vmap` the problems are solved one by one on CPUs, each stopping when it has converged; elsewhere all at once
@@ -139,7 +138,7 @@ def find_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array,
     return one_at_a_time(quick, safe)(arrays, covariance, start)
 
 
-def plain_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
+def plain_mode(terms: Terms, covariance: Matrix, start: Vector, max_steps: int) -> Mode:
     """Find the mode by full Newton steps on the weights, as long as the log posterior rises.
 
     `covariance` (n, n), `start` (n,).
@@ -154,7 +153,7 @@ def plain_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array
     return Mode(state.eta, state.residual, tolerance, steps, jnp.zeros_like(tolerance))
 
 
-def _whitened_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
+def _whitened_mode(terms: Terms, covariance: Matrix, start: Vector, max_steps: int) -> Mode:
     """Find the mode by damped Newton steps in v, from the weights `start`."""
     import optimistix as optx  # slow to import, and needed only where a fit is traced
 
@@ -191,7 +190,7 @@ def find_mode_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> 
     return mode, Mode(moved - covariance @ (inverse @ moved), nothing, nothing, nothing, nothing)
 
 
-def _stationarity(eta: Float[Array, " n"], args: tuple[Terms, Float[Array, "n n"]]) -> Float[Array, " n"]:
+def _stationarity(eta: Vector, args: tuple[Terms, Matrix]) -> Vector:
     """eta - K grad l(eta), which is 0 at the mode."""
     terms, covariance = args
     return eta - covariance @ terms(eta)[1]

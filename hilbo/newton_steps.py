@@ -11,23 +11,23 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
-from hilbo.gaussian import factorise
+from hilbo.gaussian import Matrix, Scalar, Vector, factorise
 from hilbo.numerics.linalg import cholesky, solve_lower, solve_lower_transposed
 
 __all__ = ["DampedNewton", "FullNewton"]
 
-Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
+Terms = Callable[[Vector], tuple[Vector, Vector, Vector]]
 """Log-likelihood terms, their slopes and curvatures, as `hilbo.laplace` has them."""
 
 
 class _FullState(eqx.Module):
     """State at the weights evaluated last."""
 
-    eta: Float[Array, " n"]  # K a
-    objective: Float[Array, ""]
-    residual: Float[Array, ""]
+    eta: Vector  # K a
+    objective: Scalar
+    residual: Scalar
     risen: Bool[Array, ""]
 
 
@@ -71,7 +71,7 @@ class FullNewton(optx.AbstractRootFinder):
         return y, aux, {}
 
     @staticmethod
-    def tolerance(dtype: DTypeLike) -> Float[Array, ""]:
+    def tolerance(dtype: DTypeLike) -> Scalar:
         """Tolerance of the residual, in standard deviations of the prior."""
         return jnp.asarray(jnp.finfo(dtype).eps ** (2 / 3), dtype)
 
@@ -79,13 +79,13 @@ class FullNewton(optx.AbstractRootFinder):
 class _NewtonState(eqx.Module):
     """Best point so far, and the step to be evaluated next."""
 
-    v: Float[Array, " n"]  # the mode in whitened coordinates, eta = R v
-    direction: Float[Array, " n"]
-    scale: Float[Array, ""]  # of the next step along `direction`
-    gain: Float[Array, ""]  # rate of ascent along `direction`
-    objective: Float[Array, ""]
-    residual: Float[Array, ""]
-    tolerance: Float[Array, ""]
+    v: Vector  # the mode in whitened coordinates, eta = R v
+    direction: Vector
+    scale: Scalar  # of the next step along `direction`
+    gain: Scalar  # rate of ascent along `direction`
+    objective: Scalar
+    residual: Scalar
+    tolerance: Scalar
 
 
 class DampedNewton(optx.AbstractRootFinder):
@@ -126,9 +126,7 @@ class DampedNewton(optx.AbstractRootFinder):
         return y, aux, {}
 
 
-def _newton_state(
-    terms: Terms, root: Float[Array, "n n"], v: Float[Array, " n"]
-) -> tuple[_NewtonState, Float[Array, ""]]:
+def _newton_state(terms: Terms, root: Matrix, v: Vector) -> tuple[_NewtonState, Scalar]:
     """State at `v`: objective, residual with its tolerance, and next direction.
 
     Also the rounding error of the objective.

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from hilbo.errors import InputError
 from hilbo.fitting_input import check_answers, check_shapes, remark_outside
-from hilbo.gaussian import Certificate, GaussianPosterior, mean_and_explained, shortfall
+from hilbo.gaussian import Certificate, GaussianPosterior, Matrix, Scalar, Vector, mean_and_explained, shortfall
 from hilbo.inference.ep import ep
 from hilbo.inference.ep_corrected import ep_corrected
 from hilbo.inference.exact import ExactPosterior, SamplingCertificate, exact
@@ -77,7 +77,7 @@ class Posterior(eqx.Module):
     latent: GaussianPosterior | ExactPosterior
 
     @property
-    def log_evidence(self) -> Float[Array, ""]:
+    def log_evidence(self) -> Scalar:
         """Approximate log p(responses). A scalar, in nats."""
         return self.latent.log_evidence
 
@@ -231,12 +231,7 @@ def _mean_and_explained(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[F
 
 
 def fit(
-    gp: OrdinalGP,
-    trials: Trials,
-    *,
-    inference: str = "laplace",
-    start: Float[Array, " n"] | None = None,
-    throw: bool = True,
+    gp: OrdinalGP, trials: Trials, *, inference: str = "laplace", start: Vector | None = None, throw: bool = True
 ) -> Posterior:
     """Posterior of the latent function given the responses.
 
@@ -275,7 +270,7 @@ def _without_padding(trials: Trials) -> Trials:
 
 
 @functools.partial(jax.jit, static_argnames="inference")
-def _fit(gp: OrdinalGP, trials: Trials, start: Float[Array, " n"] | None, inference: str) -> Posterior:
+def _fit(gp: OrdinalGP, trials: Trials, start: Vector | None, inference: str) -> Posterior:
     """Compiled part of `fit`."""
     trials = _without_padding(trials)
     covariance = gram(gp.kernel, trials.x, trials.x)
@@ -288,7 +283,7 @@ def _fit(gp: OrdinalGP, trials: Trials, start: Float[Array, " n"] | None, infere
     return Posterior(gp, trials, laplace(covariance, terms, start=start))
 
 
-def _exact_latent(likelihood: OrdinalProbit, trials: Trials, covariance: Float[Array, "n n"]) -> ExactPosterior:
+def _exact_latent(likelihood: OrdinalProbit, trials: Trials, covariance: Matrix) -> ExactPosterior:
     """Exact posterior by sampling, with the same samples in every fit."""
     ends = jnp.full((1,), jnp.inf, covariance.dtype)
     edges = jnp.concatenate([-ends, likelihood.thresholds.astype(covariance.dtype), ends])

@@ -78,8 +78,8 @@ MAY_IMPORT = {
 MOST_MODULES = 16  # in a folder, __init__ not counted
 MOST_ENTRIES = 32  # of hilbo/
 # What types say too little of. These numbers only go down.
-MOST_ANY = 633  # mentions of Any
-MOST_BARE = 448  # functions with a parameter that has no annotation
+MOST_ANY = 628  # mentions of Any
+MOST_BARE = 386  # functions with a parameter that has no annotation
 # The mathematics: no files, clock, printing or environment.
 MATHS = {
     *("kernels", "bcm", "numerics", "acquisition", "likelihoods", "gaussian", "laplace", "inference", "ordinal_gp"),

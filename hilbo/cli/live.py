@@ -73,8 +73,7 @@ def session(
         bool, typer.Option("--dry-run", help="Nobody takes part: no consent is looked for, and the log says so.")
     ] = False,
     seed: Annotated[
-        int | None,
-        seed_option("of the points that are chosen; by default one for each participant, or the plan's"),
+        int | None, seed_option("of the points that are chosen; by default one for each participant, or the plan's")
     ] = None,
     as_json: JsonToo = False,
 ) -> None:

@@ -9,6 +9,7 @@ from typing import Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hilbo.gaussian import Scalar
 from hilbo.ordinal_gp import OrdinalGP, OrdinalProbit
 
 __all__ = ["OF_THE_LIKELIHOOD", "Coordinates", "Learnable", "coordinates_of", "log_prior", "model_at"]
@@ -48,7 +49,7 @@ def model_at(coordinates: Coordinates, gp: OrdinalGP) -> OrdinalGP:
     return OrdinalGP(kernel, OrdinalProbit(thresholds, positive["noise"]))
 
 
-def log_prior(gp: OrdinalGP, centre: OrdinalGP, learn: Sequence[str]) -> Float[Array, ""]:
+def log_prior(gp: OrdinalGP, centre: OrdinalGP, learn: Sequence[str]) -> Scalar:
     """Log density of the weak priors at `gp`, up to a constant; `centre` is the model at their centre."""
     coordinates, centres = coordinates_of(gp, learn), coordinates_of(centre, learn)
     scale = dict.fromkeys(coordinates, 1.0) | {"first": jnp.sqrt(centre.kernel.variance)}

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree
 
+from hilbo.gaussian import Matrix, Scalar, Vector
 from hilbo.hyperparameters.coordinates import OF_THE_LIKELIHOOD, Coordinates, coordinates_of, log_prior, model_at
 from hilbo.hyperparameters.ep_evidence import ep_evidence
 from hilbo.hyperparameters.laplace_evidence import Evidence, laplace_evidence
@@ -27,7 +28,7 @@ __all__ = ["Seen", "divisor", "evidence_cost", "person_ep_evidence", "person_evi
 class Seen(NamedTuple):
     """Evaluation of the evidence: value, whether it is certified, coordinates, and starts for the next posteriors."""
 
-    log_evidence: Float[Array, ""]
+    log_evidence: Scalar
     certified: Bool[Array, ""]
     coordinates: Float[Array, " p"]
     place: PyTree[Float[Array, "M n"]]
@@ -59,7 +60,7 @@ def evidence_cost(
     return expand, Seen(zero, jnp.zeros((), bool), initial, place, moved)
 
 
-def divisor(trials: Trials) -> Float[Array, ""]:
+def divisor(trials: Trials) -> Scalar:
     """Divisor of the evidence: number of responses + 1, which scales curvatures to about 1; never 0."""
     return jnp.sum(trials.mask, dtype=trials.x.dtype) + 1.0
 
@@ -73,16 +74,7 @@ def _no_starts(
     return place, jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, initial.size), leaf.dtype), place)
 
 
-class _Summed(NamedTuple):
-    """Log evidence summed over participants, with derivatives and the evaluation."""
-
-    value: Float[Array, ""]
-    gradient: Float[Array, " p"]
-    hessian: Float[Array, "p p"]
-    seen: Seen
-
-
-def _differentiated(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordinates, last: Seen) -> _Summed:
+def _differentiated(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordinates, last: Seen) -> Expansion:
     """Expansion of the summed evidence by automatic differentiation."""
     del last
     flat, restore = ravel_pytree(coordinates)
@@ -96,10 +88,10 @@ def _differentiated(gp: OrdinalGP, trials: Trials, inference: str, coordinates: 
         return jnp.sum(evidences), jnp.all(converged)
 
     evidence = expanded(summed, flat)
-    return _Summed(*evidence[:3], Seen(evidence.value, evidence.aux, flat, (), ()))
+    return evidence._replace(aux=Seen(evidence.value, evidence.aux, flat, (), ()))
 
 
-def _closed(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordinates, last: Seen) -> _Summed:
+def _closed(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordinates, last: Seen) -> Expansion:
     """Expansion of the summed evidence in closed form.
 
     The posteriors are started from extrapolations of the last ones.
@@ -115,11 +107,11 @@ def _closed(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordina
         evidence = jax.tree.map(lambda leaf: leaf[None], alone)
     value, gradient, hessian = (jnp.sum(per_person, axis=0) for per_person in evidence[:3])
     seen = Seen(value, jnp.all(evidence.certified), flat, evidence.place, evidence.moved)
-    return _Summed(value, gradient, hessian, seen)
+    return Expansion(value, gradient, hessian, seen)
 
 
 @one_at_a_time
-def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: Float[Array, " n"]) -> Evidence:
+def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: Vector) -> Evidence:
     """Laplace's log evidence of one participant, expanded in the coordinates (in alphabetical order).
 
     `start`: weights from which the mode is searched.
@@ -129,7 +121,7 @@ def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, sta
 
 @one_at_a_time
 def person_ep_evidence(
-    gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: tuple[Float[Array, " n"], Float[Array, " n"]]
+    gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: tuple[Vector, Vector]
 ) -> Evidence:
     """EP's log evidence of one participant, expanded in the coordinates; `start` as for [`ep_evidence`][]."""
     return ep_evidence(*_parts(gp, coordinates, trials, start[0].dtype, TiltedTerms), start)
@@ -141,7 +133,7 @@ _Terms = TypeVar("_Terms", OrdinalTerms, TiltedTerms)
 def _parts(
     gp: OrdinalGP, coordinates: Coordinates, trials: Trials, dtype: DTypeLike, terms: type[_Terms]
 ) -> tuple[
-    Callable[[Float[Array, " k"]], Float[Array, "n n"]],
+    Callable[[Float[Array, " k"]], Matrix],
     Callable[[Float[Array, " l"]], _Terms],
     Float[Array, " l"],
     Float[Array, " k"],
@@ -152,7 +144,7 @@ def _parts(
     flat_likelihood, restore_likelihood = ravel_pytree(of_likelihood)
     flat_kernel, restore_kernel = ravel_pytree(of_kernel)
 
-    def covariance(flat: Float[Array, " k"]) -> Float[Array, "n n"]:
+    def covariance(flat: Float[Array, " k"]) -> Matrix:
         return gram(model_at(of_likelihood | restore_kernel(flat), gp).kernel, trials.x, trials.x)
 
     def answers(flat: Float[Array, " l"]) -> _Terms:

@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from hilbo.gaussian import Matrix, Vector
 from hilbo.hyperparameters.laplace_evidence import Conditioned, Evidence, certified, conditioned
 from hilbo.inference.ep_search import Cavities, find, residual_of
 from hilbo.inference.ep_sites import Joint, Tilted, coupling, sites_of, solve
@@ -37,11 +38,11 @@ _STEPS = 200
 
 
 def ep_evidence(
-    covariance: Callable[[Float[Array, " k"]], Float[Array, "n n"]],
+    covariance: Callable[[Float[Array, " k"]], Matrix],
     terms: Callable[[Float[Array, " l"]], Tilted],
     of_terms: Float[Array, " l"],
     shape: Float[Array, " k"],
-    start: tuple[Float[Array, " n"], Float[Array, " n"]],
+    start: tuple[Vector, Vector],
 ) -> Evidence:
     """Expansion of EP's log evidence in x = (of_terms, shape): terms depend on `of_terms`, the covariance on `shape`.
 
@@ -90,7 +91,7 @@ class _Attempt(NamedTuple):
     left: Int[Array, ""]  # attempts
 
 
-def _found_fixed_point(terms: Tilted, matrix: Float[Array, "n n"], start: Cavities) -> _Attempt:
+def _found_fixed_point(terms: Tilted, matrix: Matrix, start: Cavities) -> _Attempt:
     """Find the fixed point in a `hasty` search, with a second, full search if its residual is not met."""
 
     def attempt(last: _Attempt) -> _Attempt:
@@ -162,9 +163,7 @@ def _moves(
     return _Moves(by_mean, by_variance, slope, precision, slope_x, precision_x, pulled, widened)
 
 
-def _bilinear(
-    weights: Float[Array, " n"], precision: Float[Array, " n"], variance: Float[Array, " n"], moves: _Moves
-) -> Float[Array, "p p"]:
+def _bilinear(weights: Vector, precision: Vector, variance: Vector, moves: _Moves) -> Float[Array, "p p"]:
     """Part of the Hessian made of products of two first derivatives, symmetrised."""
     stretch = (1.0 + variance * precision)[:, None]
     by_variance = weights[:, None] * moves.slope_x - 0.5 * moves.precision_x / stretch**2

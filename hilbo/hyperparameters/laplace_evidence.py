@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from hilbo.gaussian import evidence_error, evidence_known, evidence_rounding, factorise
+from hilbo.gaussian import Matrix, Scalar, Vector, evidence_error, evidence_known, evidence_rounding, factorise
 from hilbo.laplace import Terms, find_mode
 from hilbo.numerics.linalg import solve_lower
 
@@ -42,10 +42,10 @@ _STEPS = 200
 class Evidence(NamedTuple):
     """Log evidence in p hyperparameters x, its derivatives, and the posterior at which it was computed."""
 
-    value: Float[Array, ""]
+    value: Scalar
     gradient: Float[Array, " p"]
     hessian: Float[Array, "p p"]
-    place: PyTree[Float[Array, " n"]]
+    place: PyTree[Vector]
     """Laplace's weights, or means and log variances of EP's cavities; start for the next hyperparameters."""
     moved: PyTree[Float[Array, "n p"]]
     """Derivatives of `place`."""
@@ -55,14 +55,14 @@ class Evidence(NamedTuple):
 class Conditioned(NamedTuple):
     """Prior K conditioned on observations with curvatures W: C, T, S, diag(S) and log|I + KW|."""
 
-    inverse: Float[Array, "n n"]  # C
-    transfer: Float[Array, "n n"]  # T
-    covariance: Float[Array, "n n"]  # S
-    variance: Float[Array, " n"]
-    log_determinant: Float[Array, ""]
+    inverse: Matrix  # C
+    transfer: Matrix  # T
+    covariance: Matrix  # S
+    variance: Vector
+    log_determinant: Scalar
 
 
-def conditioned(matrix: Float[Array, "n n"], curvature: Float[Array, " n"]) -> Conditioned:
+def conditioned(matrix: Matrix, curvature: Vector) -> Conditioned:
     """Compute C = (K + 1/W)^-1, T = I - C K, S = (K^-1 + W)^-1 with its diagonal, and log|I + KW|."""
     root, _, lower = factorise(matrix, curvature)
     factor = solve_lower(lower, jnp.diag(root))
@@ -74,11 +74,11 @@ def conditioned(matrix: Float[Array, "n n"], curvature: Float[Array, " n"]) -> C
 
 
 def certified(
-    value: Float[Array, ""],
-    matrix: Float[Array, "n n"],
-    at_mode: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]],
+    value: Scalar,
+    matrix: Matrix,
+    at_mode: tuple[Vector, Vector, Vector],
     post: Conditioned,
-    curvature_at: Callable[[Float[Array, " n"]], Float[Array, " n"]],
+    curvature_at: Callable[[Vector], Vector],
 ) -> Bool[Array, ""]:
     """Whether the evidence is accurate and no variance is below its rounding error.
 
@@ -94,11 +94,11 @@ def certified(
 
 
 def laplace_evidence(
-    covariance: Callable[[Float[Array, " k"]], Float[Array, "n n"]],
+    covariance: Callable[[Float[Array, " k"]], Matrix],
     terms: Callable[[Float[Array, " l"]], Terms],
     of_terms: Float[Array, " l"],
     shape: Float[Array, " k"],
-    start: Float[Array, " n"],
+    start: Vector,
 ) -> Evidence:
     """Expansion of Laplace's log evidence in x = (of_terms, shape): terms depend on `of_terms`, covariance on `shape`.
 
@@ -139,16 +139,16 @@ class _Paths(NamedTuple):
     mean: Float[Array, "n p"]
     weights: Float[Array, "n p"]
     curvature: Float[Array, "n p"]
-    adjoint: Float[Array, " n"]
+    adjoint: Vector
 
 
 def _paths(
     terms: Callable[[Float[Array, " l"]], Terms],
     of_terms: Float[Array, " l"],
-    eta: Float[Array, " n"],
+    eta: Vector,
     post: Conditioned,
     slopes: Float[Array, "n n k"],
-    posterior: tuple[Float[Array, "n n"], Float[Array, " n"], Float[Array, " n"]],
+    posterior: tuple[Matrix, Vector, Vector],
 ) -> _Paths:
     """Derivatives of mode, weights and curvatures by the hyperparameters, and the adjoint.
 
@@ -174,9 +174,7 @@ def _paths(
     )
 
 
-def _bilinear(
-    matrix: Float[Array, "n n"], post: Conditioned, slopes: Float[Array, "n n k"], paths: _Paths
-) -> Float[Array, "p p"]:
+def _bilinear(matrix: Matrix, post: Conditioned, slopes: Float[Array, "n n k"], paths: _Paths) -> Float[Array, "p p"]:
     """Part of the Hessian made of products of two first derivatives."""
     terms_count, count = paths.mean.shape[1] - slopes.shape[2], slopes.shape[2]
     through = [post.inverse @ slopes[:, :, k] for k in range(count)]

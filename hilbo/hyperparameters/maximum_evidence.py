@@ -29,6 +29,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hilbo.errors import InputError
+from hilbo.gaussian import Scalar
 from hilbo.hyperparameters.coordinates import Coordinates, Learnable, coordinates_of, model_at
 from hilbo.hyperparameters.cost import divisor, evidence_cost
 from hilbo.numerics.linalg import eigh, one_at_a_time
@@ -39,6 +40,7 @@ from hilbo.ordinal_gp import OrdinalGP, Trials
 
 __all__ = ["MaximumEvidence", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
 
+_MOST_STEPS = 100
 _RUNAWAY = 6.9  # a factor of 1000: largest change of a hyperparameter that counts as a maximum
 _AT_A_WALL = 1e-6  # of a coordinate's range
 _FLAT = (
@@ -76,7 +78,6 @@ def maximise_evidence(
     *,
     weak_priors: bool = False,
     starts: int = 4,
-    max_steps: int = 100,
     inference: str = "laplace",
 ) -> MaximumEvidence:
     """Hyperparameters that maximise the evidence of one participant's responses.
@@ -94,7 +95,7 @@ def maximise_evidence(
 
     Raises `InputError` for unknown names in `learn`, and for an inference without derivatives.
     """
-    options = _Options(_checked(learn, inference), weak_priors, starts, max_steps, inference)
+    options = _Options(_checked(learn, inference), weak_priors, starts, inference)
     return _maximise(gp, jax.tree.map(lambda leaf: leaf[None], trials), options)
 
 
@@ -105,14 +106,13 @@ def maximise_shared_evidence(
     *,
     weak_priors: bool = False,
     starts: int = 4,
-    max_steps: int = 100,
     inference: str = "laplace",
 ) -> MaximumEvidence:
     """One set of hyperparameters for all participants (`trials` stacked): maximises the sum of their log evidences.
 
     Arguments and errors as for [`maximise_evidence`][].
     """
-    return _maximise(gp, trials, _Options(_checked(learn, inference), weak_priors, starts, max_steps, inference))
+    return _maximise(gp, trials, _Options(_checked(learn, inference), weak_priors, starts, inference))
 
 
 class _Options(NamedTuple):
@@ -121,7 +121,6 @@ class _Options(NamedTuple):
     learn: tuple[str, ...]
     weak_priors: bool
     starts: int
-    max_steps: int
     inference: str
 
 
@@ -150,7 +149,7 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence
             TrustRegionNewton(),
             start,
             has_aux=True,
-            max_steps=options.max_steps,
+            max_steps=_MOST_STEPS,
             throw=False,
             options={"expand": expand, "begun": first, "known": earlier_ends},
         )
@@ -181,8 +180,8 @@ class _End(NamedTuple):
     """End of one search; `value` is infinite if it cannot win."""
 
     coordinates: Coordinates
-    value: Float[Array, ""]
-    log_evidence: Float[Array, ""]
+    value: Scalar
+    log_evidence: Scalar
     steps: Int[Array, ""]
     done: Bool[Array, ""]
     flat: Bool[Array, ""]
@@ -238,7 +237,7 @@ def _spread(initial: Coordinates, starts: int) -> Coordinates:
 
 
 def optimum_sensitivity(
-    height: Callable[[Float[Array, " d"], PyTree], Float[Array, ""]],
+    height: Callable[[Float[Array, " d"], PyTree], Scalar],
     refit: Callable[[OrdinalGP], PyTree],
     w: Float[Array, " d"],
     gp: OrdinalGP,

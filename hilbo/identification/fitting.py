@@ -22,18 +22,7 @@ from hilbo.identification.beginnings import correlation, off_zero
 from hilbo.numerics.least_squares import Solution, least_squares
 from hilbo.numerics.tracing import program
 
-__all__ = [
-    "Curve",
-    "Fit",
-    "Model",
-    "Test",
-    "curve_residuals",
-    "fit",
-    "nrmse",
-    "polish",
-    "residuals",
-    "search",
-]
+__all__ = ["Curve", "Fit", "Model", "Test", "curve_residuals", "fit", "nrmse", "polish", "residuals", "search"]
 
 Kind = Literal["relaxation", "creep", "modulus", "compliance"]
 MEASURED = ("relaxation", "creep")  # kinds with a recorded input
@@ -183,8 +172,7 @@ class Curve(eqx.Module):
 class Fit(eqx.Module):
     """Best fit of a model to tests.
 
-    `solution`: result of the search (`least_squares.Solution`); `start_costs`: cost reached from each starting point;
-    `weights` (R,) of the repeats of each curve.
+    `solution`: result of the search (`least_squares.Solution`); `weights` (R,) of the repeats of each curve.
     """
 
     model: Any  # a Model
@@ -192,7 +180,6 @@ class Fit(eqx.Module):
     solution: Solution
     lower: Float[Array, " p"]
     upper: Float[Array, " p"]
-    start_costs: Float[Array, " starts"]
     weights: tuple[Float[Array, " R"], ...]
 
     @property
@@ -243,8 +230,8 @@ def fit(tests: Sequence[Test], model: Any) -> Fit:
     curves = tuple(model.prepare(test) for test in tests)
     weights = tuple(jnp.full(test.repeats, 1 / test.repeats) for test in tests)
     lower, upper = (jnp.asarray(end) for end in model.box(tests))
-    solution, costs = search(model, curves, weights, jnp.asarray(model.starts(tests)), lower, upper)
-    return Fit(model, curves, solution, lower, upper, costs, weights)
+    solution = search(model, curves, weights, jnp.asarray(model.starts(tests)), lower, upper)
+    return Fit(model, curves, solution, lower, upper, weights)
 
 
 def polish(fitted: Fit, start: Float[Array, " p"]) -> Fit:
@@ -295,15 +282,13 @@ def search(
     starts: Float[Array, "s p"],
     lower: Float[Array, " p"],
     upper: Float[Array, " p"],
-) -> tuple[Solution, Float[Array, " s"]]:
-    """Run all starting points for a few steps and iterate the best one to convergence.
-
-    `starts` (s, p), `lower` and `upper` (p,) -> the solution, and the cost (s,) after the first steps of each start.
-    """
+) -> Solution:
+    """Run all starting points (s, p) for a few steps and iterate the best one to convergence, within the box `lower` to
+    `upper` (p,)."""
 
     def run(start, steps):
         return least_squares(lambda q: residuals(model, curves, weights, q), start, lower, upper, max_steps=steps)
 
     race = jax.vmap(lambda start: run(start, _RACE))(starts)
     costs = jnp.where(jnp.isfinite(race.cost), race.cost, jnp.inf)
-    return run(race.q[jnp.argmin(costs)], _LONGEST), race.cost
+    return run(race.q[jnp.argmin(costs)], _LONGEST)

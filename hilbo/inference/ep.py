@@ -32,9 +32,19 @@ exponential families". The elimination of the mean is derived in docs/design.md,
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
-from hilbo.gaussian import GaussianPosterior, certify, factor, inverse_and_log_determinant, square_root, still
+from hilbo.gaussian import (
+    GaussianPosterior,
+    Matrix,
+    Scalar,
+    Vector,
+    certify,
+    factor,
+    inverse_and_log_determinant,
+    square_root,
+    still,
+)
 from hilbo.inference.ep_search import Found, find
 from hilbo.inference.ep_sites import Joint, Sites, Tilted, coupling, joint_of, sites_of
 from hilbo.numerics.linalg import one_at_a_time
@@ -42,13 +52,7 @@ from hilbo.numerics.linalg import one_at_a_time
 __all__ = ["ep", "fixed_point", "gaussian", "inverse_of", "joint_at"]
 
 
-def ep(
-    covariance: Float[Array, "n n"],
-    terms: Tilted,
-    *,
-    start: Float[Array, " n"] | None = None,
-    max_steps: int = 200,
-) -> GaussianPosterior:
+def ep(covariance: Matrix, terms: Tilted, *, start: Vector | None = None, max_steps: int = 200) -> GaussianPosterior:
     """Approximate p(eta | data) by the Gaussian that matches the tilted moments (expectation propagation).
 
     **Arguments:**
@@ -66,13 +70,7 @@ def ep(
     return gaussian(terms, covariance, *fixed_point(terms, covariance, start, max_steps))
 
 
-def gaussian(
-    terms: Tilted,
-    covariance: Float[Array, "n n"],
-    mean: Float[Array, " n"],
-    variance: Float[Array, " n"],
-    cavities: Found,
-) -> GaussianPosterior:
+def gaussian(terms: Tilted, covariance: Matrix, mean: Vector, variance: Vector, cavities: Found) -> GaussianPosterior:
     """Posterior and certificate for the cavities at which `fixed_point` ended."""
     _, slope, precision = terms(mean, variance)
     inverse, _ = inverse_and_log_determinant(covariance, precision)
@@ -102,33 +100,27 @@ def gaussian(
 
 @eqx.filter_custom_jvp
 def fixed_point(
-    terms: Tilted, covariance: Float[Array, "n n"], start: Float[Array, " n"] | None, max_steps: int
-) -> tuple[Float[Array, " n"], Float[Array, " n"], Found]:
+    terms: Tilted, covariance: Matrix, start: Vector | None, max_steps: int
+) -> tuple[Vector, Vector, Found]:
     """Cavity means and variances at the fixed point, and the record of the search."""
     return find(terms, covariance, start, max_steps)
 
 
 @jax.custom_jvp
-def _joint(
-    covariance: Float[Array, "n n"], precision: Float[Array, " n"], root: Float[Array, "n n"]
-) -> Float[Array, "n n"]:
+def _joint(covariance: Matrix, precision: Vector, root: Matrix) -> Matrix:
     """S from the root R of K, without the cancellation in K - K C K; its derivative rule does not need that of R."""
     return joint_of(covariance, root, precision).covariance
 
 
 @_joint.defjvp
-def _joint_jvp(
-    primals: tuple[Array, ...], tangents: tuple[Array, ...]
-) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+def _joint_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Matrix, Matrix]:
     """dS = (I - S T) dK (I - S T)' - S dT S."""
     joint = _joint(*primals)
     transfer = jnp.eye(joint.shape[0], dtype=joint.dtype) - joint * primals[1][None, :]
     return joint, transfer @ tangents[0] @ transfer.T - (joint * tangents[1][None, :]) @ joint
 
 
-def joint_at(
-    covariance: Float[Array, "n n"], sites: Sites, variance: Float[Array, " n"]
-) -> tuple[Joint, Float[Array, "n n"]]:
+def joint_at(covariance: Matrix, sites: Sites, variance: Vector) -> tuple[Joint, Matrix]:
     """Joint posterior S at the fixed point in differentiable form, and the transfer matrix I - S T."""
     root, _ = square_root(jax.lax.stop_gradient(covariance))
     joint = _joint(covariance, sites.precision, root)
@@ -138,15 +130,13 @@ def joint_at(
 
 @jax.custom_jvp
 @one_at_a_time
-def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def inverse_of(matrix: Matrix) -> Matrix:
     """Matrix inverse with an explicit derivative rule."""
     return jnp.linalg.inv(matrix)
 
 
 @inverse_of.defjvp
-def _inverse_of_jvp(
-    primals: tuple[Array, ...], tangents: tuple[Array, ...]
-) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+def _inverse_of_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Matrix, Matrix]:
     """Derivative of the inverse: -A⁻¹ dA A⁻¹."""
     inverse = inverse_of(*primals)
     return inverse, -inverse @ tangents[0] @ inverse
@@ -188,9 +178,7 @@ def _fixed_point_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) 
 
 
 @eqx.filter_custom_jvp
-def _log_evidence(
-    terms: Tilted, covariance: Float[Array, "n n"], mean: Float[Array, " n"], variance: Float[Array, " n"]
-) -> Float[Array, ""]:
+def _log_evidence(terms: Tilted, covariance: Matrix, mean: Vector, variance: Vector) -> Scalar:
     """Log evidence of EP at the given cavities."""
     values, slope, precision = terms(mean, variance)
     _, log_determinant = inverse_and_log_determinant(covariance, precision)
@@ -199,9 +187,7 @@ def _log_evidence(
 
 
 @_log_evidence.def_jvp
-def _log_evidence_jvp(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
+def _log_evidence_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Scalar, Scalar | None]:
     """Derivative of the log evidence.
 
     It is stationary in the cavities at the fixed point, so their tangents drop out.

@@ -23,9 +23,8 @@ References: Opper, Paquet & Winther (2013), JMLR 14:2857, equations for R at sec
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from hilbo.gaussian import GaussianPosterior
+from hilbo.gaussian import GaussianPosterior, Matrix, Scalar, Vector
 from hilbo.inference.ep import fixed_point, gaussian, inverse_of, joint_at
 from hilbo.inference.ep_sites import Tilted, coupling, sites_of
 from hilbo.numerics.linalg import cholesky
@@ -34,11 +33,7 @@ __all__ = ["ep_corrected"]
 
 
 def ep_corrected(
-    covariance: Float[Array, "n n"],
-    terms: Tilted,
-    *,
-    start: Float[Array, " n"] | None = None,
-    max_steps: int = 200,
+    covariance: Matrix, terms: Tilted, *, start: Vector | None = None, max_steps: int = 200
 ) -> GaussianPosterior:
     """Expectation propagation with evidence and means corrected to second order, and covariances by linear response.
 
@@ -72,19 +67,17 @@ def ep_corrected(
 class _Cumulants(eqx.Module):
     """Inputs of the correction: e and its slopes (in mean and variance), S, and the slopes of t."""
 
-    skew: Float[Array, " n"]
-    skew_slopes: tuple[Float[Array, " n"], Float[Array, " n"]]
-    covariance: Float[Array, "n n"]
-    precision_m: Float[Array, " n"]
-    precision_v: Float[Array, " n"]
+    skew: Vector
+    skew_slopes: tuple[Vector, Vector]
+    covariance: Matrix
+    precision_m: Vector
+    precision_v: Vector
 
 
-def _skewness(
-    terms: Tilted, mean: Float[Array, " n"], variance: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], tuple[Float[Array, " n"], Float[Array, " n"]]]:
+def _skewness(terms: Tilted, mean: Vector, variance: Vector) -> tuple[Vector, tuple[Vector, Vector]]:
     """e, and its slopes in cavity mean and variance."""
 
-    def skew(mean: Float[Array, " n"], variance: Float[Array, " n"]) -> Float[Array, " n"]:
+    def skew(mean: Vector, variance: Vector) -> Vector:
         (_, _, precision), (_, _, slope) = jax.jvp(lambda m: terms(m, variance), (mean,), (jnp.ones_like(mean),))
         return slope * (1.0 + variance * precision)
 
@@ -93,17 +86,17 @@ def _skewness(
     return value, (push(ones, zeros), push(zeros, ones))
 
 
-def _off_diagonal(covariance: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def _off_diagonal(covariance: Matrix) -> Matrix:
     """Covariances between different observations: the diagonal set to 0."""
     return covariance - jnp.diag(jnp.diagonal(covariance))
 
 
-def _correction(cumulants: _Cumulants) -> Float[Array, ""]:
+def _correction(cumulants: _Cumulants) -> Scalar:
     """R, the correction of the log evidence."""
     return cumulants.skew @ (_off_diagonal(cumulants.covariance) ** 3 @ cumulants.skew) / 12.0
 
 
-def _correction_slopes(cumulants: _Cumulants) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+def _correction_slopes(cumulants: _Cumulants) -> tuple[Vector, Vector]:
     """dR/dm and dR/dv, including the part through S: dS = -S dT S."""
     covariance = _off_diagonal(cumulants.covariance)
     by_skew = covariance**3 @ cumulants.skew / 6.0
@@ -113,9 +106,7 @@ def _correction_slopes(cumulants: _Cumulants) -> tuple[Float[Array, " n"], Float
     return in_mean, by_skew * cumulants.skew_slopes[1] + by_precision * cumulants.precision_v
 
 
-def _corrected_factor(
-    factor: Float[Array, "n n"], precision: Float[Array, " n"], skew: Float[Array, " n"], widened: Float[Array, "n n"]
-) -> Float[Array, "n n"]:
+def _corrected_factor(factor: Matrix, precision: Vector, skew: Vector, widened: Matrix) -> Matrix:
     """V with V'V = the corrected C: a factor of I + A X A' (near I) times EP's own, to avoid cancellation."""
     informed = precision > 0
     ratio = jnp.where(informed, skew / jnp.where(informed, precision, 1.0), 0.0)

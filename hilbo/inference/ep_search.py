@@ -9,26 +9,14 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
-from hilbo.gaussian import square_root
+from hilbo.gaussian import Matrix, Scalar, Vector, square_root
 from hilbo.inference.ep_sites import Joint, Sites, Tilted, coupling, joint_of, sites_of, solve
 from hilbo.laplace import plain_mode
 from hilbo.numerics.linalg import one_at_a_time
 
-__all__ = [
-    "Cavities",
-    "Found",
-    "Joint",
-    "Sites",
-    "Tilted",
-    "coupling",
-    "find",
-    "joint_of",
-    "residual_of",
-    "sites_of",
-    "solve",
-]
+__all__ = ["Cavities", "Found", "find", "residual_of"]
 
 _QUICK_STEPS = 20
 _BASIN = 3.0  # mismatch, in posterior sds, below which Newton's step is tried
@@ -37,8 +25,8 @@ _BASIN = 3.0  # mismatch, in posterior sds, below which Newton's step is tried
 class Cavities(NamedTuple):
     """Cavity means and variances; variances that are not positive mark the absence of a start."""
 
-    mean: Float[Array, " n"]
-    variance: Float[Array, " n"]
+    mean: Vector
+    variance: Vector
 
     @property
     def known(self) -> Bool[Array, ""]:
@@ -49,34 +37,34 @@ class Cavities(NamedTuple):
 class Found(NamedTuple):
     """Record of the search; `changed` is the change of K by its square root, 0 where none was needed."""
 
-    residual: Float[Array, ""]
+    residual: Scalar
     """Infinite if a `hasty` search ended without measuring it; `residual_of` then computes it."""
-    tolerance: Float[Array, ""]
+    tolerance: Scalar
     iterations: Int[Array, ""]
-    changed: Float[Array, ""]
+    changed: Scalar
 
 
 class _State(eqx.Module):
     """State of the search."""
 
-    mean: Float[Array, " n"]  # of the cavities, as is the variance
-    variance: Float[Array, " n"]
-    residual: Float[Array, ""]
-    tolerance: Float[Array, ""]
-    mismatch: Float[Array, ""]  # before a Newton step, infinite before an update
-    ahead: Float[Array, ""]  # mismatch predicted after the step
-    basin: Float[Array, ""]
+    mean: Vector  # of the cavities, as is the variance
+    variance: Vector
+    residual: Scalar
+    tolerance: Scalar
+    mismatch: Scalar  # before a Newton step, infinite before an update
+    ahead: Scalar  # mismatch predicted after the step
+    basin: Scalar
     updates: Int[Array, ""]
     steps: Int[Array, ""]
 
 
 def find(
     terms: Tilted,
-    covariance: Float[Array, "n n"],
-    start: Float[Array, " n"] | Cavities | None,
+    covariance: Matrix,
+    start: Vector | Cavities | None,
     max_steps: int,
     hasty: bool | Bool[Array, ""] = False,
-) -> tuple[Float[Array, " n"], Float[Array, " n"], Found]:
+) -> tuple[Vector, Vector, Found]:
     """Find the cavity means and variances at the fixed point. `start`: weights, cavities, or None.
 
     A `hasty` search omits the last evaluation, which would only confirm that Newton's method has converged.
@@ -127,19 +115,19 @@ class _PointTerms(eqx.Module):
 
     terms: Tilted
 
-    def __call__(self, eta: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+    def __call__(self, eta: Vector) -> tuple[Vector, Vector, Vector]:
         return self.terms(eta, jnp.zeros_like(eta))
 
 
 def _search(
     terms: Tilted,
-    covariance: Float[Array, "n n"],
-    root: Float[Array, "n n"] | None,
-    initial: tuple[Float[Array, " n"], Float[Array, " n"]],
+    covariance: Matrix,
+    root: Matrix | None,
+    initial: tuple[Vector, Vector],
     max_steps: int,
-    changed: Float[Array, ""],
+    changed: Scalar,
     hasty: Bool[Array, ""],
-) -> tuple[Float[Array, " n"], Float[Array, " n"], Found]:
+) -> tuple[Vector, Vector, Found]:
     """Iterate from the `initial` means and variances to the fixed point; `changed` is passed to the record."""
     largest = jnp.asarray(jnp.inf, covariance.dtype)
     count = jnp.zeros((), jnp.int32)
@@ -161,8 +149,8 @@ def _search(
 
 
 def _initial_without_root(
-    terms: Tilted, covariance: Float[Array, "n n"], start: Float[Array, " n"] | Cavities | None
-) -> tuple[tuple[Float[Array, " n"], Float[Array, " n"]], Int[Array, ""]]:
+    terms: Tilted, covariance: Matrix, start: Vector | Cavities | None
+) -> tuple[tuple[Vector, Vector], Int[Array, ""]]:
     """Initial cavities for the search without a root, at Laplace's mode without a start.
 
     And the number of steps taken.
@@ -182,11 +170,8 @@ def _initial_without_root(
 
 
 def _initial(
-    terms: Tilted,
-    covariance: Float[Array, "n n"],
-    root: Float[Array, "n n"] | None,
-    start: Float[Array, " n"] | Cavities | None,
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    terms: Tilted, covariance: Matrix, root: Matrix | None, start: Vector | Cavities | None
+) -> tuple[Vector, Vector]:
     """Initial cavities: the prior's; or those around the mean K start, with the sites' precisions at that mean."""
     prior = jnp.diagonal(covariance)
     if start is None:
@@ -201,9 +186,7 @@ def _initial(
     return mean - variance * start, variance
 
 
-def _advance(
-    terms: Tilted, covariance: Float[Array, "n n"], root: Float[Array, "n n"] | None, search: _State
-) -> _State:
+def _advance(terms: Tilted, covariance: Matrix, root: Matrix | None, search: _State) -> _State:
     """One step of the search: evaluate the mismatch of the cavities, then take a Newton step or a damped update."""
     m, v = search.mean, search.variance
     sites = sites_of(terms, m, v)
@@ -242,19 +225,14 @@ def _advance(
 class _Means(NamedTuple):
     """Tilted means, their natural parameters a + t·mean, and the means of the joint posterior."""
 
-    tilted: Float[Array, " n"]
-    natural: Float[Array, " n"]
-    matched: Float[Array, " n"]
+    tilted: Vector
+    natural: Vector
+    matched: Vector
 
 
 def _mismatch(
-    covariance: Float[Array, "n n"],
-    root: Float[Array, "n n"] | None,
-    search: _State,
-    sites: Sites,
-    posterior: Joint,
-    means: _Means,
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    covariance: Matrix, root: Matrix | None, search: _State, sites: Sites, posterior: Joint, means: _Means
+) -> tuple[Scalar, Scalar, Scalar]:
     """Residual and tolerance of the worse of mean and variance; mismatch (posterior sds) that controls the search."""
     tilted, natural, matched = means
     epsilon = jnp.finfo(tilted.dtype).eps
@@ -274,12 +252,12 @@ def _mismatch(
 
 
 def residual_of(
-    covariance: Float[Array, "n n"],
+    covariance: Matrix,
     cavities: Cavities,
-    weights: Float[Array, " n"],
-    precision: Float[Array, " n"],
-    posterior: tuple[Float[Array, " n"], Callable[[Float[Array, " n"]], Float[Array, " n"]]],
-) -> Float[Array, ""]:
+    weights: Vector,
+    precision: Vector,
+    posterior: tuple[Vector, Callable[[Vector], Vector]],
+) -> Scalar:
     """Residual of these cavities, as the search would compute it.
 
     `posterior`: its variances, and a function that multiplies by C. With P = I - K C the means differ by P (K a - m - v
@@ -294,12 +272,8 @@ def residual_of(
 
 
 def _newton_step(
-    sites: Sites,
-    posterior: Joint,
-    variance: Float[Array, " n"],
-    mean_gap: Float[Array, " n"],
-    variance_gap: Float[Array, " n"],
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    sites: Sites, posterior: Joint, variance: Vector, mean_gap: Vector, variance_gap: Vector
+) -> tuple[Vector, Vector]:
     """Newton step (dm, dv) that closes the gaps of means and cavity variances to first order.
 
     dm = W dv + (1 + v t) mean_gap,      J dv = variance_gap - Q (dt/dm (1 + v t) mean_gap).

@@ -10,28 +10,26 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hilbo.gaussian import factorise
+from hilbo.gaussian import Matrix, Vector, factorise
 from hilbo.numerics.linalg import cholesky, one_at_a_time, solve_lower
 
 __all__ = ["Joint", "Sites", "Tilted", "coupling", "joint_of", "sites_of", "solve"]
 
-Tilted = Callable[
-    [Float[Array, " n"], Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
-]
+Tilted = Callable[[Vector, Vector], tuple[Vector, Vector, Vector]]
 """Cavity means and variances -> L_i, its slopes in the mean, and the sites' precisions t_i >= 0, elementwise."""
 
 
 class Sites(eqx.Module):
     """Slopes and precisions of the sites, and their derivatives by the cavity means and variances (elementwise)."""
 
-    slope: Float[Array, " n"]
-    precision: Float[Array, " n"]
-    slope_v: Float[Array, " n"]
-    precision_m: Float[Array, " n"]
-    precision_v: Float[Array, " n"]
+    slope: Vector
+    precision: Vector
+    slope_v: Vector
+    precision_m: Vector
+    precision_v: Vector
 
 
-def sites_of(terms: Tilted, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> Sites:
+def sites_of(terms: Tilted, mean: Vector, variance: Vector) -> Sites:
     """Sites for the given cavities, from one linearisation of the terms."""
     (_, slope, precision), push = jax.linearize(terms, mean, variance)
     ones, zeros = jnp.ones_like(mean), jnp.zeros_like(mean)  # the terms are independent, so one tangent suffices
@@ -43,12 +41,12 @@ def sites_of(terms: Tilted, mean: Float[Array, " n"], variance: Float[Array, " n
 class Joint(eqx.Module):
     """Gaussian posterior of all latent values, from prior and sites."""
 
-    covariance: Float[Array, "n n"]  # S = (K^-1 + T)^-1
-    variance: Float[Array, " n"]
-    left: Float[Array, " n"]  # 1 - t s: posterior variance / cavity variance
+    covariance: Matrix  # S = (K^-1 + T)^-1
+    variance: Vector
+    left: Vector  # 1 - t s: posterior variance / cavity variance
 
 
-def joint_of(covariance: Float[Array, "n n"], root: Float[Array, "n n"] | None, precision: Float[Array, " n"]) -> Joint:
+def joint_of(covariance: Matrix, root: Matrix | None, precision: Vector) -> Joint:
     """Joint posterior S = G'G with L G = R', LL' = I + R'TR; without the root R, S = K - K C K."""
     if root is None:
         scale, _, lower = factorise(covariance, precision)
@@ -62,9 +60,7 @@ def joint_of(covariance: Float[Array, "n n"], root: Float[Array, "n n"] | None, 
     return Joint(half.T @ half, variance, 1.0 - precision * variance)
 
 
-def coupling(
-    sites: Sites, posterior: Joint, variance: Float[Array, " n"]
-) -> tuple[Float[Array, "n n"], Float[Array, "n n"], Float[Array, "n n"]]:
+def coupling(sites: Sites, posterior: Joint, variance: Vector) -> tuple[Matrix, Matrix, Matrix]:
     """Matrices W, Q and J of Newton's step.
 
     W: derivative of the means by the cavity variances; Q: of these by the precisions; J = I + Q (dt/dv + dt/dm W). The
@@ -82,6 +78,6 @@ def coupling(
 
 
 @one_at_a_time
-def solve(matrix: Float[Array, "n n"], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+def solve(matrix: Matrix, right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """Solve `matrix` X = `right` by elimination."""
     return jnp.linalg.solve(matrix, right)

@@ -29,6 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from hilbo.errors import InputError
+from hilbo.gaussian import Matrix, Scalar, Vector
 from hilbo.inference.tilting import Box, Tilt, accepted, ordered_box, propose, tilting
 from hilbo.numerics.linalg import eigh
 from hilbo.numerics.sobol import scrambled_sobol
@@ -41,20 +42,20 @@ _REPLICATES = 32
 class SamplingCertificate(eqx.Module):
     """Accuracy of a sampled posterior."""
 
-    residual: Float[Array, ""]
+    residual: Scalar
     """The larger of the two standard errors below; infinite where the variance of f given z is below rounding."""
-    tolerance: Float[Array, ""]
+    tolerance: Scalar
     """Largest accepted residual: 0.02."""
-    log_evidence_error: Float[Array, ""]
+    log_evidence_error: Scalar
     """Standard error of the log evidence, and a bound on its rounding: eps |log evidence| max S / min of L's diagonal
     squared, which matters for contradictory responses under a prior that is much wider than the noise."""
-    mean_error: Float[Array, ""]
+    mean_error: Scalar
     """Largest standard error of a latent mean at an observed point, in prior standard deviations."""
-    effective_samples: Float[Array, ""]
+    effective_samples: Scalar
     """Squared sum of the weights over their sum of squares."""
     iterations: Int[Array, ""]
     """Newton steps to the tilting, rejected ones included."""
-    jitter: Float[Array, ""]
+    jitter: Scalar
     """Largest relative amount by which a sampled variance exceeded the prior's; the excess is dropped."""
     converged: Bool[Array, ""]
     """residual <= tolerance."""
@@ -63,12 +64,12 @@ class SamplingCertificate(eqx.Module):
 class ExactPosterior(eqx.Module):
     """Moments of p(f | responses) in the form of the other posteriors, and the samples behind them."""
 
-    mode: Float[Array, " n"]
+    mode: Vector
     """Posterior mean of the latent values at the observed points."""
-    weights: Float[Array, " n"]
-    factor: Float[Array, "n n"]
-    inverse: Float[Array, "n n"]
-    log_evidence: Float[Array, ""]
+    weights: Vector
+    factor: Matrix
+    inverse: Matrix
+    log_evidence: Scalar
     certificate: SamplingCertificate
     samples: Float[Array, "n R B"]
     """x of every replicate, 0 in rows without a response."""
@@ -78,10 +79,7 @@ class ExactPosterior(eqx.Module):
     tilt: Tilt
 
     def expectation(
-        self,
-        of: Callable[[Float[Array, ""], Float[Array, ""]], Float[Array, "*out"]],
-        cross: Float[Array, " n"],
-        prior_variance: Float[Array, ""],
+        self, of: Callable[[Scalar, Scalar], Float[Array, "*out"]], cross: Vector, prior_variance: Scalar
     ) -> tuple[Float[Array, "*out"], Float[Array, "*out"]]:
         """Posterior expectation of a function of f* and its standard error.
 
@@ -125,10 +123,10 @@ class ExactPosterior(eqx.Module):
 @eqx.filter_custom_jvp
 def exact(
     key: PRNGKeyArray,
-    covariance: Float[Array, "n n"],
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
-    noise: Float[Array, ""],
+    covariance: Matrix,
+    lower: Vector,
+    upper: Vector,
+    noise: Scalar,
     answered: Bool[Array, " n"],
     samples: int = 512 * _REPLICATES,
 ) -> ExactPosterior:
@@ -172,8 +170,8 @@ def _exact_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> NoR
 
 
 def _narrowed(
-    x: Float[Array, "n R B"], shares: Float[Array, "R B"], mean: Float[Array, " n"], answered: Bool[Array, " n"]
-) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
+    x: Float[Array, "n R B"], shares: Float[Array, "R B"], mean: Vector, answered: Bool[Array, " n"]
+) -> tuple[Matrix, Scalar]:
     """Root of I - Cov[x], and the largest eigenvalue of Cov[x] - I, clipped at 0.
 
     The box is convex, so that any positive part is sampling error.
@@ -186,13 +184,13 @@ def _narrowed(
 
 
 def _certificate(
-    covariance: Float[Array, "n n"],
+    covariance: Matrix,
     box: Box,
     tilt: Tilt,
     x: Float[Array, "n R B"],
     shares: Float[Array, "R B"],
-    excess: Float[Array, ""],
-    rounding: Float[Array, ""],
+    excess: Scalar,
+    rounding: Scalar,
 ) -> SamplingCertificate:
     """Certificate of the samples; `excess`: excess of a sampled variance over 1; `rounding` of the log evidence."""
     total = jnp.sum(shares, axis=1)
@@ -214,10 +212,7 @@ def _certificate(
 
 
 def _checked_resolution(
-    certificate: SamplingCertificate,
-    covariance: Float[Array, "n n"],
-    half: Float[Array, "n n"],
-    answered: Bool[Array, " n"],
+    certificate: SamplingCertificate, covariance: Matrix, half: Matrix, answered: Bool[Array, " n"]
 ) -> SamplingCertificate:
     """Certificate set to not converged if rounding hides the variance of an observed value given z (about noise^2)."""
     prior = jnp.diagonal(covariance)

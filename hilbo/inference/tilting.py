@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from hilbo.gaussian import Matrix, Scalar, Vector
 from hilbo.numerics.linalg import cholesky, one_at_a_time, solve_lower
 from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
 from hilbo.numerics.truncated_normal import confined_normal
@@ -22,10 +23,10 @@ __all__ = ["Box", "Tilt", "accepted", "ordered_box", "propose", "tilting"]
 class Box(eqx.Module):
     """Box in x with ordered variables; edges and `below` (L without its diagonal) are in units of L's diagonal."""
 
-    lower: Float[Array, " n"]
-    upper: Float[Array, " n"]
-    below: Float[Array, "n n"]
-    half: Float[Array, "n n"]
+    lower: Vector
+    upper: Vector
+    below: Matrix
+    half: Matrix
     """L^-1, its columns in the caller's order, its rows 0 for rows without a response."""
     answered: Bool[Array, " n"]
 
@@ -33,29 +34,23 @@ class Box(eqx.Module):
 class Tilt(eqx.Module):
     """Saddle point of psi: the tilting that minimises the variation of the weights."""
 
-    mu: Float[Array, " n"]
-    highest: Float[Array, ""]
+    mu: Vector
+    highest: Scalar
     """psi*, upper bound of psi(x, mu)."""
-    gradient: Float[Array, ""]
+    gradient: Scalar
     iterations: Int[Array, ""]
 
 
 class _Ordering(NamedTuple):
     """State of the ordering: columns of the root of S, expected values, order, and flags of the ordered variables."""
 
-    columns: Float[Array, "n n"]
-    values: Float[Array, " n"]
+    columns: Matrix
+    values: Vector
     order: Int[Array, " n"]
     is_ordered: Bool[Array, " n"]
 
 
-def ordered_box(
-    covariance: Float[Array, "n n"],
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
-    noise: Float[Array, ""],
-    answered: Bool[Array, " n"],
-) -> Box:
+def ordered_box(covariance: Matrix, lower: Vector, upper: Vector, noise: Scalar, answered: Bool[Array, " n"]) -> Box:
     """Box with its variables in greedy order: next the least probable interval given the expected earlier values."""
     n = covariance.shape[0]
     both = answered[:, None] & answered[None, :]
@@ -103,14 +98,14 @@ def _intervals(
 class _Saddle(eqx.Module):
     """Iterate of the search for the saddle point, with Newton's step from it."""
 
-    x: Float[Array, " n"]
-    mu: Float[Array, " n"]
+    x: Vector
+    mu: Vector
     gradient: Float[Array, " 2*n"]  # in x and in mu
     matrix: Float[Array, "2*n 2*n"]  # its derivative
     step: Float[Array, " 2*n"]
-    scale: Float[Array, ""]
-    size: Float[Array, ""]  # of the gradient
-    psi: Float[Array, ""]
+    scale: Scalar
+    size: Scalar  # of the gradient
+    psi: Scalar
     count: Int[Array, ""]
 
 
@@ -139,7 +134,7 @@ def tilting(box: Box, max_steps: int = 100) -> Tilt:
     return Tilt(end.mu, end.psi, end.size, end.count)
 
 
-def _expected(box: Box) -> Float[Array, " n"]:
+def _expected(box: Box) -> Vector:
     """Initial x without tilting: each coordinate at its expected value given the earlier ones, inside the box."""
 
     def one(x, k):
@@ -150,7 +145,7 @@ def _expected(box: Box) -> Float[Array, " n"]:
     return jax.lax.scan(one, jnp.zeros_like(box.lower), jnp.arange(box.lower.shape[0]))[0]
 
 
-def _saddle(box: Box, x: Float[Array, " n"], mu: Float[Array, " n"]) -> _Saddle:
+def _saddle(box: Box, x: Vector, mu: Vector) -> _Saddle:
     """psi, its gradient in x and in mu, and Newton's step, at a point."""
     shift = box.below @ x + mu
     log_mass, mean, curvature = _intervals(shift, box.lower, box.upper, box.answered)
@@ -166,7 +161,7 @@ def _saddle(box: Box, x: Float[Array, " n"], mu: Float[Array, " n"]) -> _Saddle:
 
 
 @one_at_a_time
-def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+def _solve(matrix: Matrix, right: Vector) -> Vector:
     """Solve a linear system by elimination."""
     return jnp.linalg.solve(matrix, right)
 
@@ -174,9 +169,7 @@ def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Arra
 # --- sampling
 
 
-def propose(
-    box: Box, mu: Float[Array, " n"], uniform: Float[Array, "n N"]
-) -> tuple[Float[Array, "n N"], Float[Array, " N"]]:
+def propose(box: Box, mu: Vector, uniform: Float[Array, "n N"]) -> tuple[Float[Array, "n N"], Float[Array, " N"]]:
     """Draw x (n, N) from the tilted sequence of truncated normals; also return psi (N,).
 
     `uniform`: uniform numbers (n, N).

@@ -13,6 +13,11 @@ from hilbo.numerics.polytope import Polytope, nearest, walls_of_cube
 
 __all__ = ["Choice", "climb", "spread"]
 
+_Point = Float[Array, " d"]
+_Score = Callable[[_Point], Float[Array, ""]]
+_Map = Callable[[_Point], _Point]
+_Test = Callable[[_Point], Bool[Array, ""]]
+_Neighbours = Callable[[_Point], Float[Array, "k d"]]
 _STATIONARY = 1e-8  # gradient of the score in the optimiser's coordinates,
 _HOPS, _HIGHER = 40, 1e-9  # over steps, at most; and what a step must gain, of the score
 _RESOLUTION = 1e-6  # and the trust radius at a kink of the passive set's wall: in units of the search ranges
@@ -21,7 +26,7 @@ _RESOLUTION = 1e-6  # and the trust radius at a kink of the passive set's wall: 
 class Choice(eqx.Module):
     """Maximum of a search and how it was found."""
 
-    x: Float[Array, " d"]
+    x: _Point
     """In the unit cube."""
     value: Float[Array, ""]
     """Its score."""
@@ -34,15 +39,15 @@ class Choice(eqx.Module):
 def climb(
     starts: Float[Array, "s d"],
     usable: Bool[Array, " s"],
-    score: Callable[[Float[Array, " d"]], Float[Array, ""]],
+    score: _Score,
     *,
-    from_box: Callable[[Float[Array, " d"]], Float[Array, " d"]],
-    to_box: Callable[[Float[Array, " d"]], Float[Array, " d"]],
-    feasible: Callable[[Float[Array, " d"]], Bool[Array, ""]],
-    allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
+    from_box: _Map,
+    to_box: _Map,
+    feasible: _Test,
+    allowed: _Test | None = None,
     walls: Polytope | None = None,
     held: Bool[Array, " d"] | bool = False,
-    neighbours: Callable[[Float[Array, " d"]], Float[Array, "k d"]] | None = None,
+    neighbours: _Neighbours | None = None,
     steps: int = 50,
     gain: ArrayLike = 0.0,
 ) -> Choice:
@@ -80,10 +85,10 @@ class _Straight(NamedTuple):
     often share a mode.
     """
 
-    score: Callable[[Float[Array, " d"]], Float[Array, ""]]
-    from_box: Callable[[Float[Array, " d"]], Float[Array, " d"]]
-    to_box: Callable[[Float[Array, " d"]], Float[Array, " d"]]
-    may_end: Callable[[Float[Array, " d"]], Bool[Array, ""]]
+    score: _Score
+    from_box: _Map
+    to_box: _Map
+    may_end: _Test
     steps: int
     gain: ArrayLike
 
@@ -125,17 +130,17 @@ class _Straight(NamedTuple):
 class _Within(NamedTuple):
     """Search with walls or discrete coordinates, in the optimiser's coordinates."""
 
-    score: Callable[[Float[Array, " d"]], Float[Array, ""]]
-    from_box: Callable[[Float[Array, " d"]], Float[Array, " d"]]
-    to_box: Callable[[Float[Array, " d"]], Float[Array, " d"]]
-    may_end: Callable[[Float[Array, " d"]], Bool[Array, ""]]
+    score: _Score
+    from_box: _Map
+    to_box: _Map
+    may_end: _Test
     walls: Polytope
     held: Bool[Array, " d"]
-    neighbours: Callable[[Float[Array, " d"]], Float[Array, "k d"]] | None
+    neighbours: _Neighbours | None
 
     def climbed(
-        self, start: Float[Array, " d"], usable: Bool[Array, ""], steps: int, gain: ArrayLike
-    ) -> tuple[Float[Array, " d"], Float[Array, ""], Float[Array, ""]]:
+        self, start: _Point, usable: Bool[Array, ""], steps: int, gain: ArrayLike
+    ) -> tuple[_Point, Float[Array, ""], Float[Array, ""]]:
         """Search from a start; return the end, its score, and the score of the start."""
         start_value = jnp.where(usable, self.score(start), -jnp.inf)
         if steps == 0:
@@ -207,12 +212,12 @@ def spread(
 
 
 def _polish(
-    score: Callable[[Float[Array, " d"]], Float[Array, ""]],
-    start: Float[Array, " d"],
+    score: _Score,
+    start: _Point,
     steps: int,
     gain: Any,
     options: dict[str, Any],
-) -> tuple[Float[Array, " d"], Float[Array, ""]]:
+) -> tuple[_Point, Float[Array, ""]]:
     """Newton's method within the unit cube, or between the walls of `options`; returns the end and its score."""
     import optimistix as optx  # slow to import, and needed only where a search is traced
 

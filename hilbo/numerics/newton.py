@@ -147,19 +147,15 @@ def arrives(y: PyTree, move: Float[Array, " p"], ends: Float[Array, "k p"]) -> B
     return jnp.any(jnp.max(jnp.abs(ends - target[None, :]), axis=1) < _SAME)
 
 
-def _bounds(options: dict[str, Any]) -> tuple[Float[Array, " p"] | None, Float[Array, " p"] | None]:
-    """Lower and upper bounds as vectors; None if missing."""
-    lower, upper = (ravel_pytree(options[side])[0] if side in options else None for side in ("lower", "upper"))
-    return lower, upper
-
-
 def _planned(
     expansion: Expansion, point: Float[Array, " p"], radius: Float[Array, ""], options: dict[str, Any]
 ) -> _State:
     """State at `point` with the next step, within the bounds or walls of the options."""
     if "walls" in options:
         return _plan_between(expansion, point, radius, options["walls"], options["held"])
-    return _plan(expansion, point, radius, *_bounds(options))
+    none = jnp.full_like(point, jnp.inf)
+    lower, upper = (ravel_pytree(options.get(side, end))[0] for side, end in (("lower", -none), ("upper", none)))
+    return _plan(expansion, point, radius, lower, upper)
 
 
 def _plan_between(
@@ -192,15 +188,11 @@ def _plan(
     expansion: Expansion,
     point: Float[Array, " p"],
     radius: Float[Array, ""],
-    lower: Float[Array, " p"] | None,
-    upper: Float[Array, " p"] | None,
+    lower: Float[Array, " p"],
+    upper: Float[Array, " p"],
 ) -> _State:
     """State at `point` with the next step, within a box."""
-    held = jnp.zeros(point.shape, bool)
-    if lower is not None:
-        held |= (point <= lower) & (expansion.gradient >= 0)
-    if upper is not None:
-        held |= (point >= upper) & (expansion.gradient <= 0)
+    held = (point <= lower) & (expansion.gradient >= 0) | (point >= upper) & (expansion.gradient <= 0)
     gradient = jnp.where(held, 0.0, expansion.gradient)
     hessian = jnp.where(held[:, None] | held[None, :], jnp.eye(point.size, dtype=point.dtype), expansion.hessian)
     eigenvalues, vectors = eigh(hessian)
@@ -209,10 +201,7 @@ def _plan(
     stiffness = jnp.abs(eigenvalues) + steepness / radius
     # No gradient, no step; only then may the stiffness be 0.
     move = -vectors @ (turned / jnp.where(stiffness > 0, stiffness, 1.0))
-    target = point + move
-    target = target if lower is None else jnp.maximum(target, lower)
-    target = target if upper is None else jnp.minimum(target, upper)
-    move = target - point
+    move = jnp.minimum(jnp.maximum(point + move, lower), upper) - point
     promised = -(gradient @ move + 0.5 * move @ hessian @ move)
     slow = jnp.abs(eigenvalues) + steepness
     fall = 0.5 * jnp.sum(turned**2 / jnp.where(slow > 0, slow, 1.0))

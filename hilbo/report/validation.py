@@ -170,11 +170,7 @@ def validation_section(validated: Validated) -> Content:
         "comparisons": validated.comparisons,
         "limits": validated.tables.limits,
         "regressions": {
-            number: {
-                "rows": _shown(table),
-                "warnings": table.warnings,
-                "tied": bool(table.table["term"].eq(TIE).any()),
-            }
+            number: {"rows": _shown(table), "warnings": table.warnings, "tied": bool(table.table["term"].eq(TIE).any())}
             for number, table in validated.regressions().items()
         },
     }

@@ -70,9 +70,7 @@ class Fit(NamedTuple):
 
 
 def design(
-    category: Int[np.ndarray, " n"],
-    predictors: Float[np.ndarray, "n p"],
-    edges: Float[np.ndarray, "c m"],
+    category: Int[np.ndarray, " n"], predictors: Float[np.ndarray, "n p"], edges: Float[np.ndarray, "c m"]
 ) -> Design:
     """Design with θ = (β, τ): response i lies between (`edges`·τ)_(c-1) - x_i·β and (`edges`·τ)_c - x_i·β.
 

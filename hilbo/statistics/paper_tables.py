@@ -46,7 +46,6 @@ def paper_tables(
     sets: pd.DataFrame | None = None,
     *,
     responses: Sequence[str] = RESPONSES,
-    material: str | None = None,
     level: float = 0.95,
 ) -> PaperTables:
     """Compute all statistics of the paper's validation sessions, for one material.
@@ -57,7 +56,7 @@ def paper_tables(
     table.
     """
     check_level(level)
-    table = of_material(check_validation(validation, responses), material)
+    table = of_material(check_validation(validation, responses), None)
     sources, roles = set_sources(table, sets)
     staged = table.assign(set_a=table["set_a"].map(roles), set_b=table["set_b"].map(roles))
     staged["preferred"] = [roles.get(name, name) for name in table["preferred"]]

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 from bare_server import Bare, connected, request, status, until_closed, until_words
 
-from hilbo.app.server.round_robin import Turns
+from hilbo.app.server.round_robin import RoundRobin
 from hilbo.app.server.serve import _Admission
 
 HALF = b"GET / HTTP/1.1\r\nHost: "
@@ -299,7 +299,7 @@ def test_one_of_each_goes_on_at_every_turn():
     gone, waiting = [], [*((number, None) for number in range(30)), *((number, "participant") for number in range(5))]
 
     async def turns():
-        rows = Turns(lambda who, role: gone.append((who, role)))
+        rows = RoundRobin(lambda who, role: gone.append((who, role)))
         for who, role in waiting:
             rows.add(who, role)
         rows.remove(7)

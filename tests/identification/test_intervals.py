@@ -116,7 +116,7 @@ def test_an_end_that_another_bound_sets_is_open(natural):
         lambda q: residuals(model, (curve,), weights, q), jnp.asarray([1.0, 1.9]), lower, upper, max_steps=50
     )
     assert float(solution.q[1]) < 2.07
-    sides = intervals.profile_intervals(Fit(model, (curve,), solution, lower, upper, jnp.zeros(1), weights))
+    sides = intervals.profile_intervals(Fit(model, (curve,), solution, lower, upper, weights))
     assert bool(sides.open_lower[0]) is not natural and not bool(sides.open_upper[0])
 
 
@@ -178,6 +178,6 @@ def test_too_few_repeats_have_no_bootstrap():
     curves, weights = tuple(model.prepare(t) for t in tests), (jnp.ones(4) / 4, jnp.ones(4) / 4)
     q, nothing = jnp.zeros(4), jnp.asarray(0)
     solution = Solution(q, jnp.asarray(0.0), jnp.eye(4), q, nothing, nothing > 0)
-    fitted = Fit(model, curves, solution, q, q, jnp.zeros(5), weights)
+    fitted = Fit(model, curves, solution, q, q, weights)
     with pytest.raises(InputError, match="has 4 repeats"):
         intervals.block_bootstrap(fitted, jax.random.key(0))

@@ -1,17 +1,16 @@
-"""What interrupts a session though nobody asked for it: its device, a laptop that slept, a participant who is gone, and
-a hand that does not leave.
+"""Interruptions of a session: by its device, a laptop that slept, a participant who left, a hand that does not leave.
 
-    device, clocks, signs of life --> event in the log --> the runner begins anew
+    device, clocks, signs of life --> event in the log --> the runner restarts
 
-What a device does (lost, HOLD, E-STOP, ready again) and when is the rig's to see; what that means for the trial that is
-pending is said here. Nothing that was interrupted goes on by itself: the participant presses Begin.
+The rig reports what a device does (lost, HOLD, E-STOP, ready again); here that becomes an event of the pending trial.
+After an interruption the participant must press Begin.
 """
 
 import asyncio
 import contextlib
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from hilbo.app.interface import HubInterface
@@ -30,51 +29,51 @@ _GONE = 3.0  # s without a participant's page until a trial that is being felt i
 
 
 class Interruptions:
-    """Those of a `Hub`, from `begin` to `end`."""
+    """Watches for interruptions of a `Hub`, from `begin` to `end`."""
 
     def __init__(self, hub: HubInterface):
         self.hub = hub
         self._condition = ""  # the device's, when it was last seen
-        self._unsaid: deque[Callable[[LiveSession, float], Any]] = deque()  # what it did, not yet on the disk
-        self._saying = asyncio.Lock()
+        self._unwritten: deque[Callable[[LiveSession, float], Any]] = deque()  # its events, not yet on the disk
+        self._writing = asyncio.Lock()
         self._tasks: list[asyncio.Task] = []
         self._faults: dict[str, str] = {}  # by what of the watch does not work, until it does again
         self._wall, self._steady = time.time(), time.monotonic()  # at the last look
         self._here, self._absent = False, None  # whether the participant's page is, and since when it is not
 
     async def begin(self, seen: Snapshot) -> None:
-        """Say how the device was found, and watch the time from now on."""
+        """Log the device's state, and start to watch."""
         await self._device_changed(seen, opening=True)
         self._wall, self._steady = time.time(), time.monotonic()
         self._spawn(self._watch_time())
 
     def end(self) -> None:
-        """Watch no more."""
+        """Stop watching."""
         for task in self._tasks:
             task.cancel()
 
     @property
     def fault(self) -> str | None:
-        """What of the watch does not work, in a sentence; it stands until that works again."""
+        """What fails in watching, as a sentence, until it works again."""
         return next(iter(self._faults.values()), None)
 
     def device_changed(self, seen: Snapshot) -> None:
-        """What the device did unasked is an event where it matters to a trial: the one that was pending then."""
+        """Handle a change of the device that was not requested; it concerns the trial pending at that moment."""
         self._spawn(self._device_changed(seen))
 
-    def _spawn(self, work) -> None:
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.ensure_future(work)
         self._tasks.append(task)
         task.add_done_callback(self._ended)
 
     def _ended(self, task: asyncio.Task) -> None:
-        """Nothing ends silently."""
+        """Report the exception of a task, if there is one."""
         self._tasks.remove(task)
         if not task.cancelled():
-            self._went("device", task.exception())
+            self._set_fault("device", task.exception())
 
-    def _went(self, what: str, error: BaseException | None) -> None:
-        """The experimenter is told of a fault, and no more once the same works again."""
+    def _set_fault(self, what: str, error: BaseException | None) -> None:
+        """Set or clear the fault of one kind of watch, and publish a change."""
         before = self.fault
         self._faults.pop(what, None)
         if error is not None:
@@ -87,39 +86,38 @@ class Interruptions:
         hub, condition = self.hub, _condition_of(seen)
         if condition != self._condition:
             self._condition = condition
-            self._unsaid.append(_told(seen, condition, hub.state.pending, opening))
+            self._unwritten.append(_device_event(seen, condition, hub.state.pending, opening))
             hub.begun = hub.begun and condition != "lost"  # a device that comes back does not go on by itself
-            await self._say()
+            await self._write()
             if condition == "lost":
                 hub.runner.forget()
                 hub.runner.restart()
             hub.runner.wake()
         hub.publish()
 
-    async def _say(self) -> None:
-        """What the device did, in the log in its order; what does not fit on the disk waits until there is room."""
-        async with self._saying:
-            while self._unsaid:
+    async def _write(self) -> None:
+        """Write the device's events to the log in order; while the disk is full they wait."""
+        async with self._writing:
+            while self._unwritten:
                 with contextlib.suppress(InputError):
                     try:
-                        await self.hub.commit(self._unsaid[0])
+                        await self.hub.commit(self._unwritten[0])
                     except LogError:
                         return
-                self._unsaid.popleft()
+                self._unwritten.popleft()
 
     async def _watch_time(self) -> None:
-        """A laptop that slept, a page that was closed, and what the device did that is not in the log yet. A fault is
-        told, and the watch goes on."""
+        """Check every `_LATER` s for a laptop that slept, a closed page, and events not yet in the log."""
         while True:
             await asyncio.sleep(_LATER)
             try:
                 await self._look()
-                self._went("time", None)
+                self._set_fault("time", None)
             except Exception as error:
-                self._went("time", error)
+                self._set_fault("time", error)
 
     async def _look(self) -> None:
-        """At the clocks, at what is still to be said, and for the participant's page."""
+        """One check of the clocks, of unwritten events, and of the participant's page."""
         hub, now, mono = self.hub, time.time(), time.monotonic()
         await hub.check_log()
         if hub.lost:
@@ -128,7 +126,7 @@ class Interruptions:
         self._wall, self._steady = now, mono
         if slept > _JUMP:
             await interrupt(hub, f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
-        await self._say()
+        await self._write()
         self._here, before = hub.watchers.participant_here, self._here
         if self._here != before:
             hub.publish()
@@ -142,7 +140,7 @@ class Interruptions:
 
 
 async def interrupt(hub: HubInterface, why: str) -> None:
-    """What was being felt is felt again from its beginning, once somebody presses Begin. `why`: a note in the log."""
+    """Interrupt the presentation, which restarts once Begin is pressed. `why`: a note in the log."""
     pending, hub.begun = hub.state.pending, False
     with contextlib.suppress(InputError, LogError):
         await hub.commit(lambda state, at: actions.note(state, why, at))
@@ -152,13 +150,14 @@ async def interrupt(hub: HubInterface, why: str) -> None:
 
 
 def _condition_of(seen: Snapshot) -> str:
+    """ "lost", "hold", "estop" or "ready"."""
     return "lost" if seen.lost else _STOPPED.get(seen.state, "ready")
 
 
-def _told(seen: Snapshot, condition: str, pending: Any, opening: bool) -> Callable[[LiveSession, float], Any]:
-    """Makes the event of what the device did to the trial that is pending now.
+def _device_event(seen: Snapshot, condition: str, pending: Any, opening: bool) -> Callable[[LiveSession, float], Any]:
+    """Makes the event of a device's new condition, for the trial that is pending now.
 
-    A device that held because the server before this one was killed has done what it should, and voids nothing.
+    A HOLD that began because an earlier server was killed voids nothing.
     """
     facts = {"trial": None if pending is None else pending.id, "reason": seen.lost or seen.reason, **seen.facts}
     says = "stopped" if opening and seen.excused else condition

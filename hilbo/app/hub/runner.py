@@ -1,16 +1,16 @@
-"""What happens next in a session: propose, make ready, lead through the steps, wait for the answer.
+"""The task that presents trials: propose, prepare, present step by step, wait for the answer.
 
-One task at a time, begun anew whenever an event changes what is to be felt (an answer, a break, an undo, a HOLD …).
-A rendering is made ready by the rig (`rig`) while the participant feels the reference or nothing, and a step begins
-when the rig says that it shows it. Nothing is shown before Begin, nor while something is compiled; whenever nobody is
-to feel anything the rig is told to rest, whatever it was doing. A hand that keeps a rendering from beginning is asked
-to leave; where it stays, the presentation is interrupted and nothing is forced. While the participant feels, the next
-proposal is made ready for every possible answer, so that after the answer it is only looked up.
+It is restarted whenever an event changes what is to be presented (an answer, a break, an undo, a HOLD …). The rig
+prepares a rendering while the reference or nothing is presented, and a step begins when the rig reports that it shows
+it. Nothing is presented before Begin, nor during compilation; otherwise the rig rests. A hand that blocks the start of
+a rendering is asked to leave; if it stays, the presentation is interrupted. During a presentation the next proposal is
+computed for every possible answer, so that after the answer it is only looked up.
 """
 
 import asyncio
 import contextlib
 import time
+from collections.abc import Sequence
 from concurrent.futures import Future
 from typing import Any
 
@@ -29,11 +29,12 @@ _LEAVES = 20.0  # s that it may stay after that, until the presentation is inter
 
 
 class HandError(RuntimeError):
-    """The hand has not left, and nothing begins under it."""
+    """The hand did not leave the device in time."""
 
 
 class Runner:
-    """Leads a `Hub` on: `stage` says what it is at, for the views; `ends` when the present step does (monotonic)."""
+    """The task of a `Hub` that presents trials: `stage` is what it does now, `ends` when the step ends (s,
+    monotonic)."""
 
     def __init__(self, hub: HubInterface):
         self.hub = hub
@@ -43,27 +44,27 @@ class Runner:
         self.clock: dict[str, float] = {}
         self._task: asyncio.Task | None = None
         self._stop = asyncio.Event()
-        self._asked: float | None = None  # since when the hand has been asked to leave, monotonic
+        self._asked: float | None = None  # when the hand was asked to leave, monotonic
         self._in_force: tuple[int, int, str] | None = None
-        self._showing: Showing | None = None  # what was asked for last
-        self._differs = False  # whether what is presented has ever been something else than what was asked for
+        self._showing: Showing | None = None  # the last request
+        self._differs = False  # whether the rig ever presented another rendering than requested
         self._wake = asyncio.Event()
         self._ahead: Future | None = None
         self.fits_after = 0  # fits that a participant had to wait for
 
     def key(self) -> tuple:
-        """What is to be felt now: a change begins everything anew."""
+        """Identifies what is to be presented now; when it changes, the task restarts."""
         pending = self.hub.state.pending
         return self.hub.state.screen, pending and (pending.id, pending.presentation)
 
     def restart(self) -> None:
-        """Leave what is going on, and begin with what the state says now."""
+        """Cancel the present work and start again from the current state."""
         self.cancel()
         self._stop = asyncio.Event()
         self._task = asyncio.create_task(self._run(self._stop))
 
     def cancel(self) -> None:
-        """Leave what is going on."""
+        """Cancel the present work."""
         self._stop.set()
         if self._task is not None:
             self._task.cancel()
@@ -71,15 +72,15 @@ class Runner:
         self.stage, self.step, self._asked = "idle", None, None
 
     def wake(self) -> None:
-        """What is waited for may have happened."""
+        """Check the awaited condition again."""
         self._wake.set()
 
     def forget(self) -> None:
-        """The rig has no rendering any more."""
+        """Treat the rig as having no rendering in force."""
         self._in_force = None
 
     async def _run(self, stop: asyncio.Event) -> None:
-        """Until there is nothing to do before somebody does something."""
+        """Work until only an event from outside can change the state; errors are shown, and it is tried again."""
         try:
             try:
                 await self._lead()
@@ -98,6 +99,7 @@ class Runner:
             self._again(stop)
 
     async def _lead(self) -> None:
+        """Propose and present, as far as the state allows."""
         hub = self.hub
         if hub.lost:
             await hub.rig.rest()
@@ -118,7 +120,8 @@ class Runner:
                 return
         self._at("idle")
 
-    def _again(self, stop) -> None:
+    def _again(self, stop: asyncio.Event) -> None:
+        """Restart, unless that was done already."""
         if not stop.is_set():
             asyncio.get_running_loop().call_soon(self.restart)
 
@@ -150,10 +153,9 @@ class Runner:
         self.clock["proposed"] = time.perf_counter()
 
     async def _present(self, trial: Trial) -> None:
+        """Present the steps of a trial; after a break or a restart of the server they may all be done already."""
         hub = self.hub
-        if (
-            trial.step is not None and not trial.unfinished
-        ):  # all felt already: after a break, or a restart of the server
+        if trial.step is not None and not trial.unfinished:
             self._look_ahead()
             self._at("answer")
             return
@@ -183,7 +185,8 @@ class Runner:
             loading.cancel()
         self._at("answer")
 
-    async def _step(self, trial, i, show, seconds) -> None:
+    async def _step(self, trial: Trial, i: int, show: Any, seconds: float) -> None:
+        """Present step `i` for so many seconds."""
         commit = self.hub.commit
         self._showing = self._showing_of(trial, i, show)
         shown = asyncio.ensure_future(self.hub.rig.show(self._showing))
@@ -200,8 +203,8 @@ class Runner:
         await commit(lambda state, at: actions.present(state, trial.id, i, False, at), mine=True)
 
     async def _untouched(self, work: asyncio.Future) -> Any:
-        """The result of what waits until no hand touches the rig; a hand that stays is asked to leave. Raises
-        `HandError` once it has been asked for so long."""
+        """The result of work that waits until no hand touches the rig; a hand that stays is asked to leave. Raises
+        `HandError` if it is still there `_LEAVES` s later."""
         wait = _HAND
         while not (await asyncio.wait([work], timeout=wait))[0]:
             touched, now = self.hub.rig.snapshot.contact, time.monotonic()
@@ -217,17 +220,17 @@ class Runner:
             wait = _SOON
         return await work
 
-    def _loading(self, trial, side) -> asyncio.Task:
-        """`_load`, going on beside what the participant feels."""
+    def _loading(self, trial: Trial, side: str | None) -> asyncio.Task:
+        """`_load` as a task in the background."""
         task = asyncio.ensure_future(self._load(trial, side))
-        task.add_done_callback(_looked_at)
+        task.add_done_callback(_retrieve_exception)
         return task
 
     async def _load(self, trial: Trial, side: str | None) -> None:
-        """A side made ready, and in the log if it is in force by that."""
+        """Have the rig prepare a side; logged if that puts it in force."""
         if side is None or self._in_force == (trial.id, trial.presentation, side):
             return
-        self._in_force = None  # nobody knows which, until this one is known to be
+        self._in_force = None  # unknown until this one is
         showing = self._showing_of(trial, 0, side)
         loaded = await self.hub.rig.prepare(showing)
         if loaded is not None:
@@ -235,7 +238,7 @@ class Runner:
             self._in_force = (trial.id, trial.presentation, side)
 
     async def _in_log(self, trial: Trial, side: str, loaded: Loaded) -> None:
-        """In the log that a side is in force; what is presented may be another rendering than the one asked for."""
+        """Log that a side is in force; the rendering presented may differ from the one requested."""
         self._note_times(loaded)
         await self.hub.commit(lambda state, at: actions.sent(state, trial.id, side, at, **loaded.facts), mine=True)
         now = self.hub.state.trial(trial.id)
@@ -248,15 +251,15 @@ class Runner:
         return Showing(trial.id, trial.presentation, step, show, trial.renderings.get(show), material)
 
     async def _missed(self, why: str) -> None:
-        """What was not presented voids its trial; nothing goes on by itself."""
+        """Void the trial of a step that was not presented, and wait for Begin."""
         hub, showing = self.hub, self._showing
         assert showing is not None  # only a step can be missed
         with contextlib.suppress(RefusedError):
             await hub.commit(lambda state, at: actions.missed(state, showing.trial, showing.show, why, at), mine=True)
         hub.begun = False
 
-    def _note_times(self, loaded) -> None:
-        """How long it took from an answer to parameters in force, in parts."""
+    def _note_times(self, loaded: Loaded) -> None:
+        """Record the time from an answer to the next parameters in force, by part."""
         clock, now = self.clock, time.perf_counter()
         if {"came", "chosen", "proposed"} <= set(clock):
             parts = {"total": now - clock["came"], "fsync": clock["fsync"], "chosen": clock["chosen"]}
@@ -264,7 +267,7 @@ class Runner:
         self.clock = {}
 
     async def _rig_ready(self) -> None:
-        """Wait while the rig is lost, or holds."""
+        """Wait while the rig is disconnected or in HOLD or ESTOP."""
         while True:
             seen = self.hub.rig.snapshot
             if seen.lost is None and seen.state not in ("HOLD", "ESTOP"):
@@ -278,18 +281,19 @@ class Runner:
                 await asyncio.wait_for(self._wake.wait(), _LATER)
 
     def _look_ahead(self) -> None:
-        """In the choosing's thread, while somebody feels: what comes next after each possible answer. It ends with the
-        answer: what follows is chosen in the same thread."""
+        """Compute the next proposal for each possible answer, in the thread that chooses; it stops at the answer, after
+        which that thread is needed."""
         hub = self.hub
         state, key = hub.state, self.key()
         self._ahead = hub.compute.submit(hub.chooser.lookahead, state, lambda: self.key() == key)
 
 
-def _next_side(steps, i) -> str | None:
+def _next_side(steps: Sequence[tuple[str, float]], i: int) -> str | None:
+    """The first rendering to be presented from step `i` on."""
     return next((show for show, _ in steps[i:] if show in ("a", "b")), None)
 
 
-def _looked_at(done) -> None:
-    """Its exception counts as seen, also where nobody waits for it."""
+def _retrieve_exception(done: asyncio.Future) -> None:
+    """Mark the exception of a task as retrieved, so that asyncio does not report it."""
     if not done.cancelled():
         done.exception()

@@ -12,6 +12,7 @@ import msgspec
 
 from hilbo.app.interface import HubInterface
 from hilbo.app.pages import log_words
+from hilbo.app.pages.session_views import View
 from hilbo.session.log.records import Event, Trial
 from hilbo.session.plan.set_codes import label_of
 
@@ -26,7 +27,7 @@ _TRIAL = ("id", "phase", "number", "status", "presentation", "step", "values", "
 _BANNER = "Blind: this page shows no parameter; labels stand for what is presented"
 
 
-def experimenter(hub: HubInterface, seen: Mapping[str, Any]) -> dict[str, Any]:
+def experimenter(hub: HubInterface, seen: Mapping[str, Any]) -> View:
     """The view, of what the experimenter would see who knows all."""
     state, trial = hub.state, hub.state.pending
     blocks = seen["trial"][: len(state.header.blocks)]
@@ -50,7 +51,7 @@ def _labels(hub: HubInterface, trial: Trial | None) -> dict[str, str]:
     return {} if trial is None else {side: label_of(values, hub.tag) for side, values in trial.renderings.items()}
 
 
-def _table(hub: HubInterface, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def _table(hub: HubInterface, rows: list[View]) -> View:
     """The trials, the newest first, with labels in the place of values and of names of sets."""
     labelled = []
     for trial, row in zip(reversed(hub.state.trials), rows, strict=True):

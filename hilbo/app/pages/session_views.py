@@ -13,10 +13,13 @@ from hilbo.session.log.state import LiveSession
 from hilbo.study.file.languages import language
 from hilbo.study.file.protocols import protocol
 
-__all__ = ["experimenter_view", "participant_view"]
+__all__ = ["View", "experimenter_view", "participant_view"]
+
+View = dict[str, Any]
+"""A view, or a part of one, as it becomes JSON."""
 
 
-def participant_view(state: LiveSession) -> dict[str, Any]:
+def participant_view(state: LiveSession) -> View:
     """The data of the participant's page; nothing else of a session may reach their browser.
 
     `screen` and its `message`; `trial` (id, presentation, steps with their texts and seconds, the running `step`,
@@ -39,13 +42,14 @@ def participant_view(state: LiveSession) -> dict[str, Any]:
     }
 
 
-def _spare(state):
+def _spare(state: LiveSession) -> bool:
     """Whether the warm-up has another trial to offer."""
+    assert state.block is not None  # the screen is "ready"
     before = state.block - 1
     return state.quota(before) < len(state.header.blocks[before].trials)
 
 
-def _shown_trial(state, trial: Trial):
+def _shown_trial(state: LiveSession, trial: Trial) -> View:
     session = state.study.session
     asks = protocol(session, state.header.blocks[trial.block].phase).asks
     alone = "b" not in trial.renderings
@@ -63,13 +67,13 @@ def _shown_trial(state, trial: Trial):
     }
 
 
-def _step_text(show, alone):
+def _step_text(show: str, alone: bool) -> str:
     if show == "neutral":
         return "neutral"
     return "feel_test" if alone and show == "a" else f"feel_{show}"
 
 
-def _ask(state, ask, alone):
+def _ask(state: LiveSession, ask: str, alone: bool) -> View:
     session = state.study.session
     if ask == "preferred":
         choices = [{"value": side, "label": session.text(side), "definition": ""} for side in ("a", "b")]
@@ -82,7 +86,7 @@ def _ask(state, ask, alone):
     return {"name": ask, "question": session.text(key), "choices": choices}
 
 
-def _progress(state):
+def _progress(state: LiveSession) -> View:
     """Answered and planned trials of the current block (at the end: of the last one), and the text with the trial's
     number, counted from 1."""
     block = len(state.header.blocks) - 1 if state.block is None else state.block
@@ -98,7 +102,7 @@ def _progress(state):
     return {"done": done, "of": of, "warm_up": state.header.blocks[block].phase == "warm-up", "text": text}
 
 
-def experimenter_view(state: LiveSession) -> dict[str, Any]:
+def experimenter_view(state: LiveSession) -> View:
     """The whole state, for the experimenter's page and for programs."""
     header = state.header
     return {
@@ -131,12 +135,12 @@ def experimenter_view(state: LiveSession) -> dict[str, Any]:
     }
 
 
-def _put_off(state, block, k):
+def _put_off(state: LiveSession, block: int, k: int) -> View:
     """A planned trial that was moved to the end, and how often the device stopped it."""
     return msgspec.to_builtins(state.header.blocks[block].trials[k]) | {"stops": state.stops(block)[k]}
 
 
-def _whole_trial(state, trial: Trial):
+def _whole_trial(state: LiveSession, trial: Trial) -> View:
     return {
         **trial.data,
         "status": trial.status,

@@ -6,17 +6,20 @@ parameter, a set or a prediction to it. Times are sent as remaining seconds, so 
 
 import math
 import time
+from collections.abc import Callable
 from datetime import datetime
-from typing import Any
 
 from hilbo.app.interface import HubInterface
 from hilbo.app.pages.log_words import line, meant, place_of, table
 from hilbo.app.pages.pace import minutes_left
-from hilbo.app.pages.session_views import experimenter_view, participant_view
+from hilbo.app.pages.session_views import View, experimenter_view, participant_view
+from hilbo.session.log.records import Trial
 from hilbo.session.log.state import LiveSession
 
 __all__ = ["choice_rows", "experimenter", "map_version", "participant", "place_of", "seconds_of", "trial_name"]
 
+Text = Callable[[str], str]
+"""The study's text of a key."""
 _TEXTS = {
     "page_title": "title", "more": "another", "break": "break", "saving": "sent", "disconnected": "offline",
     "moved": "moved", "space_key": "space_key",
@@ -44,7 +47,7 @@ def trial_name(hub: HubInterface) -> str | None:
     return None if trial is None else f"{hub.tag}:{trial.id}.{trial.presentation}"
 
 
-def participant(hub: HubInterface) -> dict[str, Any]:
+def participant(hub: HubInterface) -> View:
     """The participant's view; docs/guides/live.md describes it."""
     seen, session, stage = participant_view(hub.state), hub.state.study.session, hub.runner.stage
     trial, screen = seen["trial"], seen["screen"]
@@ -73,7 +76,7 @@ def participant(hub: HubInterface) -> dict[str, Any]:
     }
 
 
-def _words(hub, screen, stage, text):
+def _words(hub: HubInterface, screen: str, stage: str, text: Text) -> tuple[str, str, str]:
     """Title, message and phase while nothing is presented. How to let go of a program's stimulus is in the study's own
     texts."""
     if screen == "trial":
@@ -85,13 +88,19 @@ def _words(hub, screen, stage, text):
     return title + stop.strip(), message, screen
 
 
-def _last_of_one(hub, step) -> bool:
+def _last_of_one(hub: HubInterface, step: View | None) -> bool:
     """Whether a trial's only rendering is being presented: it may be answered meanwhile, a pair only after both."""
-    return step is not None and step["index"] + 1 == step["count"] and len(hub.state.pending.renderings) == 1
+    pending = hub.state.pending
+    return (
+        step is not None and step["index"] + 1 == step["count"] and pending is not None and len(pending.renderings) == 1
+    )
 
 
-def _step(hub, trial):
+def _step(hub: HubInterface, trial: View) -> View | None:
+    """The step that is being presented; its seconds are those left."""
     index, steps = hub.runner.step, trial["steps"]
+    if index is None:
+        return None
     left = max(0.0, hub.runner.ends - time.monotonic())
     return {
         "index": index,
@@ -103,17 +112,17 @@ def _step(hub, trial):
     }
 
 
-def _question(ask):
+def _question(ask: View) -> View:
     options = [{"value": c["value"], "label": c["label"], "text": c["definition"]} for c in ask["choices"]]
     return {"name": ask["name"], "text": ask["question"], "options": options}
 
 
-def _progress(progress, text):
+def _progress(progress: View, text: Text) -> View:
     words = f"{text('warm_up')}: {progress['text']}" if progress["warm_up"] else progress["text"]
     return {"done": progress["done"], "of": progress["of"], "text": words}
 
 
-def experimenter(hub: HubInterface) -> dict[str, Any]:
+def experimenter(hub: HubInterface) -> View:
     """The experimenter's view, in the order of the page; `whole` is the complete state, for programs."""
     state, runner = hub.state, hub.runner
     header, trial = state.header, state.pending
@@ -142,7 +151,7 @@ def experimenter(hub: HubInterface) -> dict[str, Any]:
     }
 
 
-def _banners(hub) -> list[str]:
+def _banners(hub: HubInterface) -> list[str]:
     """Notices of a session whose data do not count."""
     header, banners = hub.state.header, []
     if header.dry_run:
@@ -154,7 +163,7 @@ def _banners(hub) -> list[str]:
     return banners
 
 
-def _phase_words(hub, trial):
+def _phase_words(hub: HubInterface, trial: Trial | None) -> str:
     runner = hub.runner
     if runner.stage == "step" and trial is not None:
         return participant_view(hub.state)["trial"]["steps"][runner.step]["text"]
@@ -163,7 +172,7 @@ def _phase_words(hub, trial):
     return _PHASE_WORDS.get(runner.stage, runner.stage)
 
 
-def _trial_rows(hub, trial):
+def _trial_rows(hub: HubInterface, trial: Trial | None) -> list[list[str]]:
     state = hub.state
     rows = []
     for i, block in enumerate(state.header.blocks):
@@ -183,7 +192,7 @@ def _trial_rows(hub, trial):
     return rows
 
 
-def choice_rows(choice: dict[str, Any]) -> list[list[str]]:
+def choice_rows(choice: View) -> list[list[str]]:
     """Why a rendering was chosen, as rows of name and value; null stands in logs for numbers that were not finite."""
     rows = []
     mean, sd = choice.get("mean"), choice.get("sd")
@@ -226,7 +235,7 @@ def _set_words(study, values):
     )
 
 
-def _device(hub):
+def _device(hub: HubInterface) -> View:
     seen = hub.rig.snapshot
     level = "bad" if seen.lost or seen.state in ("HOLD", "ESTOP") else "good" if seen.state == "RUNNING" else "rest"
     state, rows = "lost" if seen.lost else seen.state.lower(), [list(row) for row in seen.rows]
@@ -235,7 +244,8 @@ def _device(hub):
     return {"title": hub.rig.title, "state": state, "level": level, "words": words, "rows": rows}
 
 
-def _may(hub):
+def _may(hub: HubInterface) -> list[str]:
+    """The commands that are possible now."""
     state, seen = hub.state, hub.rig.snapshot
     actions = ["note", "invite"] + ([] if seen.lost else ["estop"])
     if seen.state in ("HOLD", "ESTOP") and not seen.lost:

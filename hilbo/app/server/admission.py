@@ -1,8 +1,8 @@
-"""The door of a server: an experimenter is let in at once, all others when it is their turn.
+"""Admission of connections: the experimenter's at once, all others by round robin.
 
-A connection that is accepted is first only looked at: what has come is read without taking it. That costs a tenth of
-what it costs to serve it, so that a thousand strangers who come again and again do not hold up who comes behind them.
-Those who say nothing wait outside; of too many, and after `PATIENCE`, the oldest is sent away.
+An accepted connection is first only inspected: its data are read without being consumed. That costs a tenth of serving
+it, so that a thousand strangers who reconnect again and again do not hold up others. Connections that have sent nothing
+are pending; the oldest of too many, and each after `PATIENCE`, is closed.
 """
 
 import asyncio
@@ -12,29 +12,29 @@ from collections.abc import Callable
 from typing import Any
 
 from hilbo.app.server.connections import LOOKED, PATIENCE
-from hilbo.app.server.round_robin import Turns
+from hilbo.app.server.round_robin import RoundRobin
 from hilbo.app.wire.security import Gate, Role
 
-__all__ = ["Porter"]
+__all__ = ["Listener"]
 
 _AT_ONCE = 64  # connections accepted at one turn
 _BACKLOG = 1024  # those that wait for it in the kernel
 
 
-class Porter:
-    """Stands at a listening socket. `admit` is called with each connection that is let in and the role whose key came
-    with it, if one did; `most` may wait outside."""
+class Listener:
+    """Accepts the connections of a listening socket. `admit` is called with each admitted connection and the role whose
+    key came with it, if any; at most `most` connections are pending."""
 
     def __init__(
         self, listening: socket.socket, gate: Gate, most: int, admit: Callable[[socket.socket, Role | None], Any]
     ):
         self._listening, self._gate, self._most, self._admit = listening, gate, most, admit
-        self._outside: dict[socket.socket, float] = {}  # until when, oldest first
+        self._pending: dict[socket.socket, float] = {}  # deadlines, oldest first
         self._silent: set[socket.socket] = set()
-        self._turns = Turns(self._let_in)  # of those of them who have said something
+        self._queues = RoundRobin(self._admit_line)  # of those that have sent something
 
     def open(self) -> None:
-        """From now on, in the event loop that runs."""
+        """Start accepting, in the running event loop."""
         self._loop = asyncio.get_running_loop()
         self._listening.setblocking(False)
         self._listening.listen(_BACKLOG)
@@ -42,11 +42,11 @@ class Porter:
         self._clock = self._loop.call_later(1.0, self._tick)
 
     def close(self) -> None:
-        """Nobody else comes in."""
+        """Stop accepting, and close the pending connections."""
         self._clock.cancel()
         self._loop.remove_reader(self._listening)
-        for line in list(self._outside):
-            self._send_away(line)
+        for line in list(self._pending):
+            self._close_line(line)
 
     def _accept(self) -> None:
         for _ in range(_AT_ONCE):
@@ -58,22 +58,22 @@ class Porter:
                 self._make_room(0)
                 break
             line.setblocking(False)
-            self._outside[line] = self._loop.time() + PATIENCE
-            if not self._look(line):
+            self._pending[line] = self._loop.time() + PATIENCE
+            if not self._inspect(line):
                 self._silent.add(line)
-                self._loop.add_reader(line.fileno(), self._speaks, line)
+                self._loop.add_reader(line.fileno(), self._readable, line)
             self._make_room(self._most)
 
     def _make_room(self, most: int) -> None:
-        if len(self._outside) > most:
-            self._send_away(next(iter(self._outside)))
+        if len(self._pending) > most:
+            self._close_line(next(iter(self._pending)))
 
-    def _speaks(self, line: socket.socket) -> None:
+    def _readable(self, line: socket.socket) -> None:
         self._unwatch(line)
-        self._look(line)
+        self._inspect(line)
 
-    def _look(self, line: socket.socket) -> bool:
-        """Whether something has come; then the connection is let in, has its turn, or is over."""
+    def _inspect(self, line: socket.socket) -> bool:
+        """Whether data have come; then the connection is admitted, queued, or closed."""
         try:
             said = line.recv(LOOKED, socket.MSG_PEEK)
         except BlockingIOError:
@@ -82,18 +82,18 @@ class Porter:
             said = b""
         role = self._gate.role_in(said)
         if not said:
-            self._send_away(line)
+            self._close_line(line)
         elif role == "experimenter":
-            self._let_in(line, role)
+            self._admit_line(line, role)
         else:
-            self._turns.add(line, role)
+            self._queues.add(line, role)
         return True
 
-    def _let_in(self, line: socket.socket, role: Role | None) -> None:
+    def _admit_line(self, line: socket.socket, role: Role | None) -> None:
         self._forget(line)
         self._admit(line, role)
 
-    def _send_away(self, line: socket.socket) -> None:
+    def _close_line(self, line: socket.socket) -> None:
         self._forget(line)
         self._unwatch(line)
         with contextlib.suppress(OSError):
@@ -105,11 +105,11 @@ class Porter:
             self._loop.remove_reader(line.fileno())
 
     def _forget(self, line: socket.socket) -> None:
-        self._outside.pop(line, None)
-        self._turns.remove(line)
+        self._pending.pop(line, None)
+        self._queues.remove(line)
 
     def _tick(self) -> None:
         now = self._loop.time()
-        for line in [line for line, until in self._outside.items() if until < now]:
-            self._send_away(line)
+        for line in [line for line, until in self._pending.items() if until < now]:
+            self._close_line(line)
         self._clock = self._loop.call_later(1.0, self._tick)

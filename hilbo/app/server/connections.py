@@ -1,10 +1,9 @@
-"""Connections to the server, and how much of it each may take, so that whoever holds a key is always heard.
+"""Connections to the server and their limits, so that holders of a key are always served.
 
-A connection is a stranger's until a key of a role has come in on it; then it is the role's. Strangers and each role
-have numbers of connections of their own, and of too many the oldest is given up. An experimenter is heard at once,
-who presents, participants and strangers by turns, each request of theirs anew. A stranger's connection ends with its
-first answer. A request has `PATIENCE` s and `LARGEST` bytes, header and body, and so has all of a stranger's
-connection.
+A connection is a stranger's until a role's key has come in on it. Strangers and each role have limits of their own for
+the number of connections; the oldest of too many is closed. The experimenter is served at once; stimulus programs,
+preparers, participants and strangers by round robin, request by request. A stranger's connection ends with its first
+response. A request has `PATIENCE` s and `LARGEST` bytes, header and body, and so has all of a stranger's connection.
 
 uvicorn and h11 do the rest; without this, they would wait for a header for ever, and read a body of any size.
 """
@@ -16,7 +15,7 @@ import h11
 from uvicorn.protocols.http.flow_control import CLOSE_HEADER
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from hilbo.app.server.round_robin import Turns
+from hilbo.app.server.round_robin import RoundRobin
 from hilbo.app.wire.security import Gate, Role
 
 __all__ = ["LARGEST", "LOOKED", "PATIENCE", "Connection", "Connections"]
@@ -35,61 +34,61 @@ class Connections:
     def __init__(self, gate: Gate):
         self.gate = gate
         self._open: dict[Role | None, dict[Connection, None]] = {role: {} for role in _MOST}
-        self._turns = Turns(lambda connection, _: connection.hear())
+        self._queues = RoundRobin(lambda connection, _: connection.process())
 
     def add(self, connection: "Connection") -> None:
-        """A new one, or one whose role has become another; the oldest of too many is given up."""
+        """Add a connection, new or with a new role; the oldest of too many is closed."""
         mine = self._open[connection.role]
         mine[connection] = None
         if len(mine) > _MOST[connection.role]:
             oldest = next(iter(mine))
             self.remove(oldest)
-            oldest.give_up()
+            oldest.abort()
 
     def remove(self, connection: "Connection") -> None:
-        """It is open no more, or another's."""
+        """Remove a connection that has ended, or changes its role."""
         self._open[connection.role].pop(connection, None)
-        self._turns.remove(connection)
+        self._queues.remove(connection)
 
     def wait(self, connection: "Connection") -> None:
-        """Have it heard when its turn comes."""
+        """Queue it to be served."""
         if connection.role == "experimenter":
-            connection.hear()
+            connection.process()
         else:
-            self._turns.add(connection, connection.role)
+            self._queues.add(connection, connection.role)
 
 
 class Connection(H11Protocol):
-    """One connection, which reads nothing new before what it has read was heard. `role` is that of the first key."""
+    """One connection, which reads no more data before those it has were processed. `role` is that of the first key."""
 
     def __init__(self, others: Connections, role: Role | None = None, **uvicorns: Any):
         super().__init__(**uvicorns)
         self.role: Role | None = role
         self._others = others
-        self._unheard = self._seen = b""
+        self._unprocessed = self._seen = b""
         self._size = 0
         self._limit: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
-        """Somebody comes."""
+        """The connection begins."""
         super().connection_made(transport)
         self._others.add(self)
-        self._limit_time()
+        self._start_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """It has ended, whoever ended it."""
+        """The connection has ended."""
         self._others.remove(self)
-        self._unlimit_time()
+        self._stop_timer()
         self._unset_keepalive_if_required()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Keep it for this connection's turn, and look whose it is."""
+        """Keep the data until the connection is served, and look for a key."""
         self._size += len(data)
         if self._size > LARGEST:
-            self.give_up()
+            self.abort()
             return
-        self._unheard += data
+        self._unprocessed += data
         seen = self._seen + data[:LOOKED]
         self._seen = seen[-_SEEN:]
         role = self._others.gate.role_in(seen)
@@ -100,11 +99,11 @@ class Connection(H11Protocol):
         self.transport.pause_reading()
         self._others.wait(self)
 
-    def hear(self) -> None:
-        """What has come, as HTTP."""
+    def process(self) -> None:
+        """Process the data as HTTP."""
         if self.transport.is_closing():
             return
-        data, self._unheard = self._unheard, b""
+        data, self._unprocessed = self._unprocessed, b""
         if data:
             self._unset_keepalive_if_required()
             self.conn.receive_data(data)
@@ -115,53 +114,53 @@ class Connection(H11Protocol):
         if not self.flow.read_paused and (self.role is not None or self._begun()):
             self.transport.resume_reading()
         if self._begun():
-            self._limit_time()
+            self._start_timer()
         elif self.role is not None:
-            self._unlimit_time()
+            self._stop_timer()
 
     def handle_events(self) -> None:
-        """Another request may have come with the one that was answered; it waits for its turn as that one did."""
-        if self._unheard or self.conn.trailing_data[0]:
+        """A further request that came with the one answered is queued like any other."""
+        if self._unprocessed or self.conn.trailing_data[0]:
             self.transport.pause_reading()
             self._others.wait(self)
 
     def on_response_complete(self) -> None:
-        """A role's next request is counted from here."""
+        """The size of a role's next request is counted from here."""
         if self.role is not None:
             self._size = 0
             self.timeout_keep_alive = _KEPT
         super().on_response_complete()
 
     def send_400_response(self, msg: str) -> None:
-        """Say that this is no HTTP, if there is a way to say it; an answer that had begun is not gone on with."""
+        """Report invalid HTTP, where that is possible; a response that had begun is abandoned."""
         if self.cycle is not None:
             self.cycle.disconnected = True
             self.cycle.message_event.set()
         try:
             super().send_400_response(msg)
         except h11.LocalProtocolError:
-            self.give_up()
+            self.abort()
 
     def shutdown(self) -> None:
-        """The server ends: nobody waits for the rest of a request."""
+        """The server ends: incomplete requests are dropped."""
         if self._begun():
-            self.give_up()
+            self.abort()
         else:
             super().shutdown()
 
-    def give_up(self) -> None:
-        """End it, whatever it is at."""
+    def abort(self) -> None:
+        """Close the connection at once."""
         self.transport.abort()
 
     def _begun(self) -> bool:
-        """Whether a request has not come to its end, or not begun."""
+        """Whether a request is incomplete, or none has begun."""
         return self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
 
-    def _limit_time(self) -> None:
+    def _start_timer(self) -> None:
         if self._limit is None:
-            self._limit = self.loop.call_later(PATIENCE, self.give_up)
+            self._limit = self.loop.call_later(PATIENCE, self.abort)
 
-    def _unlimit_time(self) -> None:
+    def _stop_timer(self) -> None:
         if self._limit is not None:
             self._limit.cancel()
             self._limit = None

@@ -76,17 +76,17 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any], 
 
     Raises what keeps the hub from opening, `InputError` or `DeviceError`; nobody has been answered then.
     """
-    from hilbo.app.server.admission import Porter
+    from hilbo.app.server.admission import Listener
 
     sys.setswitchinterval(_SWITCH)
     server = _server(place.gate, hub, tried)
     admission = _Admission(server)
-    porter = Porter(place.socket, place.gate, max(1, _files() - _RESERVED), admission.admit)
-    _open_and_close(server, hub, porter, admission, started)
+    listener = Listener(place.socket, place.gate, max(1, _files() - _RESERVED), admission.admit)
+    _open_and_close(server, hub, listener, admission, started)
     try:
-        # The default of Windows has no add_reader, which the porter needs.
+        # The default of Windows has no add_reader, which the listener needs.
         with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
-            runner.run(server.serve(sockets=[]))  # the porter has it
+            runner.run(server.serve(sockets=[]))  # the listener has it
     finally:
         place.socket.close()
 
@@ -107,7 +107,7 @@ def _server(gate: Gate, hub: Any, tried: Any) -> Any:
 
 
 def _open_and_close(
-    server: Any, hub: Any, porter: Any, admission: "_Admission", started: Callable[[Callable[[], None]], Any]
+    server: Any, hub: Any, listener: Any, admission: "_Admission", started: Callable[[Callable[[], None]], Any]
 ) -> None:
     """Have the hub opened before the server answers, and closed after it. Not as ASGI's lifespan, which swallows what
     the hub raises."""
@@ -117,7 +117,7 @@ def _open_and_close(
         try:
             await hub.open()
             await listen(sockets=sockets)
-            porter.open()
+            listener.open()
         except BaseException:
             await hub.close()
             raise
@@ -125,7 +125,7 @@ def _open_and_close(
             started(stop)
 
     async def shutdown(sockets=None):
-        porter.close()
+        listener.close()
         hub.hang_up()
         await admission.settled()  # uvicorn ends those that it knows, and waits for all
         try:
@@ -140,7 +140,7 @@ def _open_and_close(
 
 
 class _Admission:
-    """Has uvicorn serve connections that were accepted elsewhere."""
+    """Passes accepted connections to uvicorn."""
 
     def __init__(self, server: Any):
         self._protocol = functools.partial(
@@ -155,10 +155,10 @@ class _Admission:
         task.add_done_callback(self._tasks.discard)
 
     async def settled(self) -> None:
-        """Until each of them is known to uvicorn, or has ended."""
+        """Wait until each of them is known to uvicorn, or has ended."""
         await asyncio.gather(*self._tasks)
 
-    async def _serve(self, line, role):
+    async def _serve(self, line: socket.socket, role: Role | None) -> None:
         with contextlib.suppress(OSError):  # it has ended meanwhile
             loop = asyncio.get_running_loop()
             await loop.connect_accepted_socket(functools.partial(self._protocol, role=role), line)

@@ -20,7 +20,7 @@ import asyncio
 import contextlib
 import html
 import mimetypes
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ import msgspec
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
+from starlette.responses import HTMLResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from hilbo.app.hub.commands import COMMANDS, NotNowError, others_present
@@ -45,6 +45,9 @@ __all__ = ["application"]
 # In memory: a visitor then takes neither a file of this process nor a thread of it.
 _FILES = {path.name: path.read_bytes() for path in (Path(__file__).parents[1] / "static").iterdir()}
 _ALIVE = 5.0  # s between signs of life in a silent stream
+Served = Any
+"""The `Hub` of a session, or the check of a stimulus program in its place."""
+Handler = Callable[[Request], Awaitable[Response]]
 _DAY = 86_400
 _TAKEN = "This link has been used by a program that is still there; end that one first, or ask for a new link."
 _JOIN_TEXTS = ("lang", "wait", "no_link", "used_link", "no_server")
@@ -60,7 +63,7 @@ _HEADERS = {
 
 
 class _Guard:
-    """Refuses what comes from elsewhere, before anything looks at it; and says to browsers what pages may do."""
+    """Middleware that refuses requests from other origins, and sets the security headers of all responses."""
 
     def __init__(self, app: Any, gate: Gate):
         self.app, self.gate = app, gate
@@ -82,29 +85,24 @@ class _Guard:
             await (_error(403, why) if why else self.app)(scope, receive, sending)
 
 
-def application(hub: Any, gate: Gate, tried: Tried | None = None) -> Starlette:
+def application(hub: Served, gate: Gate, tried: Tried | None = None) -> Starlette:
     """The server of one session, whose `Hub` is open; or of what stands in a hub's place. `tried`: it is `hilbo try`'s,
     and has its page."""
     guarded = _for(hub, gate)
     routes = [
         Route("/", _way_in(hub)),
         Route("/api/join", _either(_join(hub, gate)), methods=["POST"]),
-        Route("/api/experimenter/map", guarded("experimenter", _map), methods=["GET"]),
+        Route("/api/experimenter/map", guarded("experimenter", _map)),
     ]
-    for role in PAGES:
-        routes += [Route(f"/{role}", _role_page(hub, gate, role))]
+    routes += [Route(f"/{role}", _role_page(hub, gate, role)) for role in PAGES]
     for role in ("participant", "experimenter"):
-        routes += [
-            Route(f"/api/{role}", guarded(role, _view), methods=["GET"]),
-            Route(f"/api/{role}/events", guarded(role, _events), methods=["GET"]),
-        ]
+        routes += [Route(f"/api/{role}", guarded(role, _view)), Route(f"/api/{role}/events", guarded(role, _events))]
     routes += [Route("/api/participant/answer", guarded("participant", _answer), methods=["POST"])]
     routes += [Route(f"/api/participant/{n}", guarded("participant", _press), methods=["POST"]) for n in PRESSES]
     routes += [Route(f"/api/experimenter/{n}", guarded("experimenter", _command), methods=["POST"]) for n in COMMANDS]
-    routes += [Route("/api/preparer", guarded("preparer", _report), methods=["POST"])]
-    routes += [Route("/api/preparer/hello", guarded("preparer", _hello), methods=["POST"])]
-    routes += [Route("/api/stimulus", _either(guarded("stimulus", _report)), methods=["POST"])]
-    routes += [Route("/api/stimulus/hello", _either(guarded("stimulus", _hello)), methods=["POST"])]
+    for path, handler in (("", _report), ("/hello", _hello)):
+        routes += [Route(f"/api/preparer{path}", guarded("preparer", handler), methods=["POST"])]
+        routes += [Route(f"/api/stimulus{path}", _either(guarded("stimulus", handler)), methods=["POST"])]
     if tried is not None:
         routes += [Route("/try", _page("try.html")), Route("/api/try", guarded("stimulus", _json_of(tried.facts)))]
         routes += [Route("/api/try/map", guarded("stimulus", _json_of(tried.map)))]
@@ -112,18 +110,18 @@ def application(hub: Any, gate: Gate, tried: Tried | None = None) -> Starlette:
     return Starlette(routes=routes, middleware=[Middleware(_Guard, gate=gate)])
 
 
-def _file(name) -> Response:
+def _file(name: str) -> Response:
     return Response(_FILES[name], media_type=mimetypes.guess_type(name)[0])
 
 
-def _page(name):
+def _page(name: str) -> Handler:
     async def page(_request: Request) -> Response:
         return _file(name)
 
     return page
 
 
-def _join_page(hub, status=200) -> Response:
+def _join_page(hub: Served, status: int = 200) -> Response:
     """The page that trades a link's token, in the study's language."""
     page = _FILES["join.html"].decode()
     for key in _JOIN_TEXTS:
@@ -131,14 +129,14 @@ def _join_page(hub, status=200) -> Response:
     return HTMLResponse(page, status)
 
 
-def _way_in(hub):
+def _way_in(hub: Served) -> Handler:
     async def page(_request: Request) -> Response:
         return _join_page(hub)
 
     return page
 
 
-def _role_page(hub, gate, role):
+def _role_page(hub: Served, gate: Gate, role: Role) -> Handler:
     async def page(request: Request) -> Response:
         if not gate.admits(role, request.cookies.get(gate.cookies[role])):
             return _join_page(hub, 401)
@@ -147,8 +145,8 @@ def _role_page(hub, gate, role):
     return page
 
 
-def _either(handler):
-    """The handler's answer in JSON, or in lines to whoever sent a form."""
+def _either(handler: Handler) -> Handler:
+    """The handler's response as JSON, or as lines of text where the request was a form."""
 
     async def handle(request: Request) -> Response:
         answer = await handler(request)
@@ -160,18 +158,19 @@ def _either(handler):
     return handle
 
 
-def _is_form(request) -> bool:
+def _is_form(request: Request) -> bool:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower() == lines.FORM
 
 
-async def _message(kind, request) -> Any:
-    """The request's message; an object of JSON is one whatever its header says: many clients call all bodies forms."""
+async def _message(kind: type, request: Request) -> Any:
+    """The request's message. A JSON object is read as JSON whatever its header says: many clients declare
+    every body a form."""
     body = await _body(request)
     request.state.form = _is_form(request) and not body.lstrip().startswith(b"{")
     return messages.read(kind, body, request.state.form)
 
 
-def _join(hub, gate):
+def _join(hub: Served, gate: Gate) -> Handler:
     async def join(request: Request) -> Response:
         try:
             message = await _message(messages.Join, request)
@@ -181,7 +180,7 @@ def _join(hub, gate):
             return _error(400, "This link is for a program that presents, not for a browser; give it to the program.")
         used_by = gate.let_in(message.token)
         if used_by in PAGES and gate.admits(used_by, request.cookies.get(gate.cookies[used_by])):
-            return JSONResponse({"role": used_by})  # the same browser opens its link again
+            return _json({"role": used_by})  # the same browser opens its link again
         back = used_by == "stimulus" and message.bearer and isinstance(hub.rig, StimulusRig)
         if back and not await hub.rig.free():
             return _error(401, _TAKEN)
@@ -194,18 +193,18 @@ def _join(hub, gate):
         role, key = granted
         hub.watchers.end(role)
         if message.bearer:
-            return JSONResponse({"role": role, "key": key})
-        reply = JSONResponse({"role": role})
+            return _json({"role": role, "key": key})
+        reply = _json({"role": role})
         reply.set_cookie(gate.cookies[role], key, max_age=_DAY, httponly=True, samesite="strict", path="/")
         return reply
 
     return join
 
 
-def _for(hub, gate):
-    """Makes handlers of (hub, role, request) that only somebody with the role's key reaches."""
+def _for(hub: Served, gate: Gate) -> Callable[[Role, Callable], Handler]:
+    """Makes handlers of functions of (hub, role, request), which require the role's key."""
 
-    def guarded(role: Role, handler: Callable):
+    def guarded(role: Role, handler: Callable) -> Handler:
         async def handle(request: Request) -> Response:
             program = _bearer(request)
             if not gate.admits(role, program or request.cookies.get(gate.cookies.get(role, ""))):
@@ -229,64 +228,64 @@ def _for(hub, gate):
     return guarded
 
 
-async def _view(hub, role, _request) -> Response:
+async def _view(hub: Served, role: Role, _request: Request) -> Response:
     return _json(hub.view(role))
 
 
-async def _map(hub, _role, _request) -> Response:
+async def _map(hub: Served, _role: Role, _request: Request) -> Response:
     slices = await hub.map()
     return _error(404, "This session has no map.") if slices is None else _json(slices)
 
 
-def _json_of(content):
-    """A handler of what is found in a hub."""
+def _json_of(content: Callable[[Any], Awaitable[Any]]) -> Callable:
+    """A handler whose response is computed from the hub."""
 
-    async def handle(hub, _role, _request) -> Response:
+    async def handle(hub: Served, _role: Role, _request: Request) -> Response:
         return _json(await content(hub))
 
     return handle
 
 
-async def _answer(hub, role, request) -> Response:
+async def _answer(hub: Served, role: Role, request: Request) -> Response:
     message = messages.read(messages.Answer, await _body(request))
     accepted = await hub.answer(message, _page_of(request))
     return _json(accepted | {"view": hub.view(role)})
 
 
-async def _press(hub, role, request) -> Response:
+async def _press(hub: Served, role: Role, request: Request) -> Response:
     message = messages.read(messages.Press, await _body(request))
     await hub.press(request.url.path.rpartition("/")[2], message, _page_of(request))
     return _json({"view": hub.view(role)})
 
 
-async def _command(hub, _role, request) -> Response:
+async def _command(hub: Served, _role: Role, request: Request) -> Response:
     message = messages.read(messages.Command, await _body(request))
     return _json(await hub.command(request.url.path.rpartition("/")[2], message))
 
 
-def _presenter(hub, role) -> StimulusRig:
-    """The rig that a program is, or a person. Raises `InputError` where another presents."""
+def _presenter(hub: Served, role: Role) -> StimulusRig:
+    """The rig of a stimulus program or a preparer. Raises `InputError` in sessions with another rig."""
     if not isinstance(hub.rig, StimulusRig) or hub.rig.role != role:
         raise InputError(others_present(hub.rig.title))
     return hub.rig
 
 
-async def _hello(hub, role, request) -> Response:
+async def _hello(hub: Served, role: Role, request: Request) -> Response:
     message = await _message(messages.Hello, request)
     return _json(await _presenter(hub, role).hello(message, _bearer(request) or ""))
 
 
-async def _report(hub, role, request) -> Response:
+async def _report(hub: Served, role: Role, request: Request) -> Response:
     return _json(await _presenter(hub, role).report(await _message(messages.Report, request)))
 
 
-async def _events(hub, role, request) -> Response:
+async def _events(hub: Served, role: Role, request: Request) -> Response:
     page = request.query_params.get("page", "")
     return StreamingResponse(_stream(hub, role, page[:64]), media_type="text/event-stream")
 
 
-async def _stream(hub, role, page) -> AsyncIterator[bytes]:
-    """The view now and after every change; the newest one where several came at once."""
+async def _stream(hub: Served, role: Role, page: str) -> AsyncIterator[bytes]:
+    """The view now and after every change; only the newest one after several changes at once."""
     watcher = hub.watchers.add(role, page)
     hub.publish()
     try:
@@ -306,8 +305,8 @@ async def _stream(hub, role, page) -> AsyncIterator[bytes]:
         hub.publish()
 
 
-async def _body(request) -> bytes:
-    """The body, or as much of it as shows that it is too large."""
+async def _body(request: Request) -> bytes:
+    """The body; of one that is too large only a part."""
     body = b""
     async for part in request.stream():
         body += part
@@ -316,23 +315,24 @@ async def _body(request) -> bytes:
     return body
 
 
-def _bearer(request) -> str | None:
+def _bearer(request: Request) -> str | None:
+    """The key of a program's request; None of a browser's."""
     kind, _, key = request.headers.get("authorization", "").partition(" ")
     return key.strip() if kind.lower() == "bearer" and key.strip() else None
 
 
-def _page_of(request) -> str | None:
-    """Which window of a browser sends this; None for a program with a key."""
+def _page_of(request: Request) -> str | None:
+    """The id of the browser window that sends a request; None for a program with a key."""
     return None if _bearer(request) else request.headers.get("x-hilbo-page", "")[:64]
 
 
-def _json(content, status=200) -> Response:
+def _json(content: Any, status: int = 200) -> Response:
     return Response(msgspec.json.encode(content), status, media_type="application/json")
 
 
-def _not_understood(error) -> Response:
+def _not_understood(error: InputError) -> Response:
     return _error(413 if isinstance(error, messages.TooLargeError) else 400, str(error))
 
 
-def _error(status, sentence) -> Response:
-    return JSONResponse({"error": sentence}, status)
+def _error(status: int, sentence: str) -> Response:
+    return _json({"error": sentence}, status)

@@ -1,5 +1,4 @@
-"""Who looks at a session: open pages and programs of the two roles; a participant's newest window is the one that
-counts."""
+"""The open pages and programs of the two roles; of a participant's windows the newest is the active one."""
 
 import asyncio
 import contextlib
@@ -16,8 +15,8 @@ _QUIET = 3.0  # s without a sign of life from a participant's page, which gives 
 
 
 class Watcher:
-    """Somebody who looks at a role's view. `news` is set when there is a newer one; `ended` when it looks no more,
-    because of `why`. `seen` is when it last gave a sign of life, monotonic."""
+    """A page or program that receives a role's view. `news` is set when there is a newer view; `ended` when it gets no
+    more, because of `why`. `seen` is the time of its last sign of life, monotonic."""
 
     def __init__(self, role: Role, page: str):
         self.role, self.page, self.seen = role, page, time.monotonic()
@@ -26,64 +25,64 @@ class Watcher:
         self.why = ""
 
     def end(self, why: str = "") -> None:
-        """It shall look no more."""
+        """End its stream."""
         self.ended, self.why = True, why
         self.news.set()
 
 
 class Watchers:
-    """All who look now. `moved` says to a window that another one has taken over."""
+    """All open streams. `moved` is the text for a window that another one replaced."""
 
     def __init__(self, moved: Callable[[], str]):
         self._moved, self._asked = moved, -math.inf
         self._all: list[Watcher] = []
 
     def add(self, role: Role, page: str) -> Watcher:
-        """A new one; a participant's newest window ends the others."""
+        """Add a stream; a participant's new window ends the others."""
         if role == "participant":
             self.end(role, but=page)
         self._all.append(Watcher(role, page))
         return self._all[-1]
 
     def remove(self, watcher: Watcher) -> None:
-        """It looks no more."""
+        """Remove a stream."""
         with contextlib.suppress(ValueError):
             self._all.remove(watcher)
 
     def end(self, role: Role, but: str | None = None) -> None:
-        """The pages of a role are out, but one."""
+        """End the streams of a role, except those of one page."""
         for watcher in self._all:
             if watcher.role == role and watcher.page != but:
                 watcher.end(self._moved())
 
     def end_all(self) -> None:
-        """The server ends."""
+        """End all streams."""
         for watcher in list(self._all):
             watcher.end()
 
     def tell(self) -> None:
-        """There is news."""
+        """Notify all of a newer view."""
         for watcher in self._all:
             watcher.news.set()
 
     def heard(self) -> None:
-        """A program asks in the participant's place."""
+        """Note that a program acts as the participant."""
         self._asked = time.monotonic()
 
     def alive(self, page: str | None) -> None:
-        """A participant's page is there: an open stream alone says nothing of a network that went silently."""
+        """Note a sign of life of a participant's page: an open stream alone does not show a dead network."""
         for watcher in self._all:
             if watcher.role == "participant" and watcher.page == page:
                 watcher.seen = time.monotonic()
 
     @property
     def participant_here(self) -> bool:
-        """Whether a participant's page is open and has said so lately, or a program in its place has asked lately."""
+        """Whether a participant's page, or a program in its place, has given a sign of life lately."""
         now, newest = time.monotonic(), self._newest()
         return (newest is not None and now - newest.seen < _QUIET) or now - self._asked < _SILENT
 
     def counts(self, page: str | None) -> bool:
-        """Whether a participant's window is the newest; a program, which has none, always counts."""
+        """Whether a participant's window is the newest; a program, which has none, always is."""
         newest = self._newest()
         return page is None or newest is None or newest.page == page
 

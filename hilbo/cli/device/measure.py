@@ -20,9 +20,7 @@ _FOAM = (-2.89, 5.70, 5.89, 0.203, 101)  # what lies under a simulated device th
 
 @takes(line=Line)
 def selftest(
-    line: Line,
-    echoes: Annotated[int, typer.Option(min=1, help="Round trips.")] = 300,
-    as_json: JsonToo = False,
+    line: Line, echoes: Annotated[int, typer.Option(min=1, help="Round trips.")] = 300, as_json: JsonToo = False
 ) -> None:
     """Loopback, latency, and whether the device lets go when the host falls silent."""
     from hilbo.identification.motor import device_tests

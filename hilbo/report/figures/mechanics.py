@@ -25,6 +25,7 @@ _LABELS = {
     "modulus": ("time (s)", "relaxation modulus ({})"),
     "compliance": ("time (s)", "creep compliance (1/{})"),
 }
+_OTHERS = (2, 25, 201, None)  # memories that are compared with the fit's
 _LINES = ((ORANGE, "-."), (GREEN, "--"), (RED, ":"), ("#CC79A7", "--"), ("black", ":"), ("#56B4E9", "-."))
 
 
@@ -35,14 +36,9 @@ def predicted(fitted: Fit, kind: str) -> np.ndarray:
 
 
 @styled
-def curves_figure(
-    tests: Sequence[Test],
-    result: Characterisation,
-    unit: str = "N/mm",
-    shown: Sequence[int | None] = (2, 25, 201, None),
-) -> Figure:
+def curves_figure(tests: Sequence[Test], result: Characterisation, unit: str = "N/mm") -> Figure:
     """Above: mean and ± sd of the repeats, the fit, and fits with other memories; below: what each leaves over."""
-    others = [row for row in result.rows if row.N in shown and getattr(result.fit.model, "N", None) != row.N]
+    others = [row for row in result.rows if row.N in _OTHERS and getattr(result.fit.model, "N", None) != row.N]
     lines = [
         (row.fit, colour, dash, 0.9, "full memory" if row.N is None else f"N = {row.N}")
         for row, (colour, dash) in zip(others, _LINES, strict=False)
@@ -88,7 +84,7 @@ def _fit_name(fit):
 
 
 @styled
-def memory_figure(rows: Sequence[Row], limit: float = LIMIT) -> Figure:
+def memory_figure(rows: Sequence[Row]) -> Figure:
     """Error of the best fit against the number of taps, test by test; full memory as a level line."""
     figure, axes = new_figure(6.0, 2.9)
     taps = [(row.N, row.nrmse) for row in rows if row.N is not None]
@@ -100,7 +96,7 @@ def memory_figure(rows: Sequence[Row], limit: float = LIMIT) -> Figure:
         for row in rows:
             if row.N is None:
                 axes.axhline(100 * row.nrmse[kind], color=colour, linestyle=":", label=f"{kind}, full memory")
-    axes.axhline(100 * limit, color=GREY, linewidth=0.8, linestyle="--", label=f"{100 * limit:g} %")
+    axes.axhline(100 * LIMIT, color=GREY, linewidth=0.8, linestyle="--", label=f"{100 * LIMIT:g} %")
     axes.set(xscale="log", yscale="log", xlabel="past samples N", ylabel="NRMSE of the best fit (%)")
     axes.set_xticks([N for N, _ in taps], [str(N) for N, _ in taps])
     low, high = axes.get_ylim()
@@ -111,9 +107,9 @@ def memory_figure(rows: Sequence[Row], limit: float = LIMIT) -> Figure:
     return figure
 
 
-def _needed(model, delay, count=600):
+def _needed(model: FOSLS, delay: float):
     """Frequencies (Hz), the damping they ask for (N·s/m), and the curve whose real part that is."""
-    omega = np.geomspace(2 * np.pi * 0.5, np.pi / model.T, count)
+    omega = np.geomspace(2 * np.pi * 0.5, np.pi / model.T, 600)
     response = np.asarray(model.frequency_response(jnp.asarray(omega)))
     cotangent = np.tan((np.pi - omega * model.T) / 2)
     curve = 500 * model.T * (1 + 1j * cotangent) * response

@@ -7,16 +7,7 @@ import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import (
-    BLUE,
-    GREY,
-    ONE_COLUMN,
-    RED,
-    TWO_COLUMNS,
-    legend,
-    new_figure,
-    styled,
-)
+from hilbo.report.figures.style import BLUE, GREY, ONE_COLUMN, RED, TWO_COLUMNS, legend, new_figure, styled
 
 __all__ = ["people_figure", "predictive_check"]
 

@@ -48,11 +48,11 @@ def rules_figure(content: dict[str, Any]) -> Figure:
 
 
 @styled
-def reliability_figure(content: dict[str, Any], rules: tuple[str, ...] = ("bcm", "hierarchical")) -> Figure:
+def reliability_figure(content: dict[str, Any]) -> Figure:
     """Predicted probabilities of categories against how often they were chosen, for two rules."""
     figure, axes = new_figure(ONE_COLUMN, 3.0)
     axes.plot([0, 1], [0, 1], color=GREY, linewidth=1)
-    for rule, colour, marker in zip(rules, (ORANGE, BLUE), ("s", "o"), strict=True):
+    for rule, colour, marker in (("bcm", ORANGE, "s"), ("hierarchical", BLUE, "o")):
         bins = content["rules"].get(rule, {}).get("reliability", [])
         points = [[b[key] for b in bins] for key in ("predicted", "observed")]
         axes.plot(*points, color=colour, marker=marker, markersize=4, linewidth=1, label=rule)

@@ -12,16 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from hilbo.report.figures.maps import plane
-from hilbo.report.figures.style import (
-    RED,
-    TWO_COLUMNS,
-    label_axes,
-    legend,
-    new_figure,
-    star,
-    styled,
-    title,
-)
+from hilbo.report.figures.style import RED, TWO_COLUMNS, label_axes, legend, new_figure, star, styled, title
 from hilbo.study.analysis.analysis import Reading
 from hilbo.study.analysis.tolerance import slice_through
 
