@@ -72,7 +72,7 @@ def test_a_message_that_is_too_large_is_told_so(server):
 
 
 def test_the_oldest_stranger_is_given_up_and_nobody_with_a_key(server, monkeypatch):
-    monkeypatch.setattr("hilbo.app.server.round_robin._APART", 0.0005)  # s: a stranger's turn comes sooner
+    monkeypatch.setattr("hilbo.app.server.round_robin._INTERVAL", 0.0005)  # s: a stranger's turn comes sooner
     with connected(server.port) as mine:
         assert status(server.stops(mine)) == 200
         strangers = [connected(server.port) for _ in range(900)]

@@ -109,7 +109,7 @@ def test_the_watch_goes_on_after_a_fault_and_says_so(live, monkeypatch):
         raise RuntimeError("no such thing")
 
     monkeypatch.setattr("hilbo.app.hub.interruptions._LATER", 0.05)
-    monkeypatch.setattr(interruptions, "_say", broken)
+    monkeypatch.setattr(interruptions, "_write", broken)
     view = live.until(lambda v: v["alert"], live.whole)
     assert "no such thing" in view["alert"] and "what interrupts the session" in view["alert"]
     seen = len(looked)
