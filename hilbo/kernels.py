@@ -98,7 +98,8 @@ class RBF(eqx.Module):
 class Matern32(eqx.Module):
     """Matern covariance of smoothness 3/2, variance * (1 + s) exp(-s) with s^2 = 6 theta |x - x'|^2.
 
-    Arguments and errors as for `RBF`. Twice differentiable in each point, also where both are equal.
+    Arguments and errors as for `RBF`, theta a scalar or (d,). Twice differentiable in each point, also where both are
+    equal.
     """
 
     theta: Float[Array, "*d"]

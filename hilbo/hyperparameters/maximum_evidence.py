@@ -110,7 +110,7 @@ def maximise_shared_evidence(
 ) -> MaximumEvidence:
     """One set of hyperparameters for all participants (`trials` stacked): maximises the sum of their log evidences.
 
-    Arguments and errors as for [`maximise_evidence`][].
+    Arguments as for [`maximise_evidence`][]; raises the same `InputError`s.
     """
     return _maximise(gp, trials, _Options(_checked(learn, inference), weak_priors, starts, inference))
 
