@@ -223,6 +223,7 @@ def _matern32_slope(r: Float[Array, ""]) -> Float[Array, ""]:
 
 @_matern32_slope.defjvp
 def _matern32_slope_jvp(primals, tangents):
+    """Second derivative of the correlation by r, exp(-s) / (4 s); taken as 0 at r = 0."""
     (r,) = primals
     apart = r > 0
     root = jnp.sqrt(jnp.where(apart, r, 1.0))

@@ -42,11 +42,13 @@ class FullNewton(optx.AbstractRootFinder):
     norm: Callable = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        """Initial state, before any evaluation."""
         del fn, args, options, f_struct, aux_struct, tags
         infinite = jnp.asarray(jnp.inf, y.dtype)
         return _FullState(y, -infinite, infinite, jnp.asarray(True))
 
     def step(self, fn, y, args, options, state, tags):
+        """Evaluate the weights `y` and take a full Newton step."""
         del fn, options, tags
         terms, covariance = args
         eta = covariance @ y
@@ -63,6 +65,7 @@ class FullNewton(optx.AbstractRootFinder):
         return following, _FullState(eta, objective, residual, objective >= state.objective - slack), None
 
     def terminate(self, fn, y, args, options, state, tags):
+        """Whether the residual is below the tolerance, or the log posterior has stopped rising."""
         del fn, args, options, tags
         return ~(state.risen & (state.residual > self.tolerance(y.dtype))), optx.RESULTS.successful
 
@@ -100,12 +103,14 @@ class DampedNewton(optx.AbstractRootFinder):
     norm: Callable = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        """Initial state at `options["start"]`, before any evaluation."""
         del fn, args, f_struct, aux_struct, tags
         infinite = jnp.asarray(jnp.inf, y.dtype)
         zero, one = jnp.zeros_like(infinite), jnp.ones_like(infinite)
         return _NewtonState(options["start"], jnp.zeros_like(y), one, zero, -infinite, infinite, zero)
 
     def step(self, fn, y, args, options, state, tags):
+        """Evaluate the planned point; accept it, or halve the step."""
         del fn, tags
         root = options["root"]
         trial = state.v + state.scale * state.direction
@@ -118,6 +123,7 @@ class DampedNewton(optx.AbstractRootFinder):
         return jnp.where(risen, root @ trial, y), state, None
 
     def terminate(self, fn, y, args, options, state, tags):
+        """Whether the residual is below its tolerance, or the step has become negligible."""
         del fn, y, args, options, tags
         return (state.residual <= state.tolerance) | (state.scale < 1e-12), optx.RESULTS.successful
 

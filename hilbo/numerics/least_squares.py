@@ -47,6 +47,8 @@ class _Evaluation(NamedTuple):
 
 
 class _State(NamedTuple):
+    """State of the iteration."""
+
     q: Float[Array, " p"]
     cost: Float[Array, ""]
     gradient: Float[Array, " p"]

@@ -69,20 +69,20 @@ class _State(eqx.Module):
 
 
 class TrustRegionNewton(optx.AbstractMinimiser):
-    """For `optimistix.minimise`. `options` may hold
+    """Trust-region Newton minimiser for `optimistix.minimise`. `options` may hold
 
     - "lower" and "upper": bounds, each like the variables;
-    - "walls" (a `Polytope`) and "held": in their place, linear walls within the unit cube, and which variables stay as
-      they are. The start is between the walls;
-    - "expand": a function of the variables, and of what the function returned besides its value at the best point so
-      far, that gives an [`Expansion`][] in the variables as one vector, in place of automatic differentiation;
-    - "begun": what "expand" gave at the start, which then is not evaluated again;
-    - "known": ends (k, p) of other searches, NaN where there is none. A search whose next step goes to one ends.
+    - "walls" (a `Polytope`) and "held": instead of bounds, linear walls within the unit cube, and which variables stay
+      fixed. The start is between the walls;
+    - "expand": a function of the variables, and of the auxiliary output at the best point so far, that returns an
+      [`Expansion`][] in the variables as one vector, instead of automatic differentiation;
+    - "begun": the result of "expand" at the start, which then is not evaluated again;
+    - "known": ends (k, p) of other searches, NaN where there is none. A search whose next step leads to one stops.
 
-    Ends where no free component of the gradient is above `atol`, where the quadratic model falls by less than `gain`
-    within a radius of 1 (a plateau, on which a gradient may take long to vanish), or where the trust radius is below
-    `resolution` (a kink of the function, or its rounding); `state.here` is the expansion at the end. A start at which
-    the function is not finite is where it ends.
+    Stops if no free component of the gradient is above `atol`, if the quadratic model decreases by less than `gain`
+    within a radius of 1 (a plateau, on which a gradient may vanish slowly), or if the trust radius is below
+    `resolution` (a kink of the function, or its rounding); `state.here` is the expansion at the end. Stops at once if
+    the function is not finite at the start.
     """
 
     rtol: float = 0.0

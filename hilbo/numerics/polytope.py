@@ -71,6 +71,8 @@ class _Turned(NamedTuple):
 
 
 class _State(NamedTuple):
+    """State of the active-set method."""
+
     active: Bool[Array, " k"]
     multipliers: Float[Array, " k"]
     entering: Int[Array, ""]  # index of the wall that is being taken in, -1: the next is to be chosen

@@ -189,12 +189,12 @@ class Constraint:
 
 @dataclass(frozen=True)
 class Mechanics:
-    """What the renderer adds to the box: the FO-SLS, its memory and rate, and the device's damping.
+    """Model of the renderer: the FO-SLS's effective stiffness, memory, rate and delay, and the device's damping.
 
     `K_eff`: effective stiffness H(1), N/mm. `damping`: physical damping b of the device, N·s/m. `effective_damping`:
     optional range of dH/ds at s = 0, N·s/m. `N`: taps (odd) of short memory; `states`: exponentials of full memory,
-    for which alone the effective damping depends on them, and not on K1; `T`: s. `delay`: from the sample of the
-    position to its force, s, 0 to T.
+    which affect only the effective damping, not the largest K1; `T`: s. `delay`: from the sample of the position to its force, s, 0
+    to T.
     """
 
     K_eff: float

@@ -1,13 +1,13 @@
-"""The columns of K1 in a box with mechanics: which part of each is feasible, and how wide they all are.
+"""Columns of K1 in a box with mechanics: the feasible interval of K1 given the other parameters, and its width.
 
-A column is what K1 may be beside the other parameters, on [0, 1] of its range. It ends at the largest passive K1. With
-a range of effective damping, or constraints on K1, it may start above the lowest K1 too, and end earlier (`feasibility`
-has all ends). A column whose passive end is below the lowest K1, or with no K1 in the range, has width 0 and holds no
-feasible point.
+A column is the set of feasible K1 for given other parameters, on [0, 1] of its range. It ends at the largest passive
+K1. With a range of effective damping, or constraints on K1, it may start above the lowest K1, and end earlier
+(`feasibility` has all ends). A column whose passive end is below the lowest K1, or with no K1 in the range, has width 0
+and contains no feasible point.
 
-Points that fill the passive part evenly come from uniform numbers by the Rosenblatt map whose density is the column's
-width over (B1, α), from a table; Rosenblatt (1952), Ann. Math. Stat. 23:470. So a constraint with another parameter, on
-which a width would depend too, has no part in it (`drawn`): it refuses points instead.
+Uniform points of the passive part come from uniform numbers by the Rosenblatt map whose density is the column's width
+over (B1, α), from a table; Rosenblatt (1952), Ann. Math. Stat. 23:470. A constraint with another parameter, on which a
+width would also depend, is not part of it (`drawn`): its points are rejected instead.
 """
 
 import dataclasses

@@ -140,8 +140,10 @@ def screen(
 
 
 class _Found(NamedTuple):
+    """State of the screening."""
+
     bounds: Float[Array, " c"]  # of columns without variances
-    highest: Float[Array, ""]  # value yet,
+    highest: Float[Array, ""]  # value so far,
     top: tuple[Int[Array, ""], Int[Array, ""]]  # and its row and column; row -1: none of a column
     hopes: Float[Array, " c"]  # the largest of each column with variances, -inf for others,
     rows: Int[Array, " c"]  # and where it is
@@ -178,8 +180,10 @@ def _first_largest(values: Float[Array, "r *c"]) -> Int[Array, "*c"]:
 
 
 class _Columns(eqx.Module):
-    """Prior covariances of asked points and nodes, as factors along and across columns and at their ends; which nodes
-    and ends may be chosen; scores."""
+    """Prior covariances between observed points and nodes, factorised along and across columns; usable nodes.
+
+    Scores.
+    """
 
     down: Float[Array, "g n"]
     across: Float[Array, "n c"]

@@ -1,11 +1,11 @@
 """Linear constraints between parameters: a polytope in the optimiser's coordinates, and points in it and on its walls.
 
-Numbers of NumPy, made once for a space. A constraint is linear in physical units, so that a parameter on a logarithmic
-scale that is in one is searched in its unit, from 0 at its low end to 1 at its high one. A wall stands `MARGIN` of the
-ranges inside what the study says: rounding must not carry a choice beyond it.
+NumPy numbers, computed once for a space. A constraint is linear in physical units, so that a parameter on a logarithmic
+scale that is in one is searched in its unit, from 0 at its low end to 1 at its high one. A wall is `MARGIN` of the
+ranges inside the specified inequality, so that rounding does not move a choice beyond it.
 
-Where few points of the cube are feasible, others are found by hit and run (Smith 1984, Oper. Res. 32:1296): many
-chains, which all begin in the middle of the largest ball within.
+If few points of the cube are feasible, others are found by hit and run (Smith 1984, Oper. Res. 32:1296): many chains,
+which all start at the centre of the largest inscribed ball.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,7 +20,7 @@ from hilbo.search.box import Constraint, Parameter
 __all__ = ["MARGIN", "Walls", "check_room", "ends_of_rays", "inside", "rows_of"]
 
 MARGIN = 1e-9
-"""Of the ranges: how far inside the stated inequalities the search has its walls."""
+"""Distance of the search's walls inside the specified inequalities, as a fraction of the ranges."""
 _LEAST = 1e-6  # radius of the largest ball, in units of the ranges: less is no volume
 _CHAINS, _BURN_IN, _APART = 512, 200, 20  # steps of hit and run
 

@@ -33,7 +33,10 @@ _LAST_STEP = 1e-9  # of the largest parameter: Newton's last step, whose square 
 
 
 class Design(NamedTuple):
-    """The edges of n answers as functions of k parameters; an open side has an infinite offset and a row of zeros."""
+    """Edges of n responses as linear functions of k parameters.
+
+    An open side has an infinite offset and a row of zeros.
+    """
 
     upper: Float[np.ndarray, "n k"]
     lower: Float[np.ndarray, "n k"]

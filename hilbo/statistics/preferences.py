@@ -1,9 +1,9 @@
 """Counts of validation sessions: classes of each set, preferences of each pair, rates with every kind of interval.
 
-The rate of a pair is wins/(wins + losses); ties are counted beside it, and modelled by `logits.tied_preferences`.
-Wilson and Clopper-Pearson ("exact") intervals take all answers as independent. The clustered ones are those of
-the logit's intercept, mapped to rates, so that they stay within 0 and 1. Where one set always won there is nothing to
-cluster; then the exact interval of the participants, all of whom agreed, stands beside that of the answers.
+The rate of a pair is wins/(wins + losses); ties are counted separately, and modelled by `logits.tied_preferences`.
+Wilson and Clopper-Pearson ("exact") intervals assume independent responses. The clustered ones are those of the logit's
+intercept, mapped to rates, so that they stay within 0 and 1. If one set always won, errors cannot be clustered; then
+the exact interval of the participants, who all agreed, is given in addition to that of the responses.
 """
 
 from collections.abc import Mapping, Sequence
