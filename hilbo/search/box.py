@@ -193,8 +193,8 @@ class Mechanics:
 
     `K_eff`: effective stiffness H(1), N/mm. `damping`: physical damping b of the device, N·s/m. `effective_damping`:
     optional range of dH/ds at s = 0, N·s/m. `N`: taps (odd) of short memory; `states`: exponentials of full memory,
-    which affect only the effective damping, not the largest K1; `T`: s. `delay`: from the sample of the position to its force, s, 0
-    to T.
+    which affect only the effective damping, not the largest K1; `T`: s. `delay`: from the sample of the position to its
+    force, s, 0 to T.
     """
 
     K_eff: float
