@@ -163,10 +163,12 @@ def sized(team, people):
 
     import numpy as np
 
-    from hilbo.study.cohort import cohort_of, read_trials
+    from hilbo.study.cohort import cohort_of
     from hilbo.study.config import Study
     from hilbo.study.estimate import batch
     from hilbo.study.estimate.batch_optimum import optima_from
+    from hilbo.study.formats.csv_file import cell_pieces
+    from hilbo.study.tables.trials import trial_table
 
     study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
     points = study.space.candidates(POINTS, 0)
@@ -175,7 +177,7 @@ def sized(team, people):
         making = [sys.executable, "-c", MAKE.format(root=str(ROOT), people=people, path=str(path))]
         subprocess.run(making, check=True)  # in a process of its own: this one's memory is measured
         begun = time.perf_counter()
-        cohort = cohort_of(read_trials(path, study, others=False), study)
+        cohort = cohort_of(trial_table(cell_pieces(path), study.file, source=str(path), others=False), study)
         read = time.perf_counter() - begun
     population = batch.population_of(study, cohort, team)
     few = population if people <= 1000 else population.every(2 * population.block)

@@ -125,6 +125,7 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
     start()
     from hilbo.study.cohort import cohort_of
     from hilbo.study.config import Study
+    from hilbo.study.formats.csv_file import cell_pieces
     from hilbo.study.tables.flag_counts import flag_sentences_of
     from hilbo.study.tables.trials import trial_table
 
@@ -136,8 +137,15 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
 
         table = read_log_trials(trials, whole.file, material, others=False, note=remark)
     else:
-        table = trial_table(trials, chosen.file, material, others=False, say=lambda rows: say("rows read", rows))
-    return chosen, cohort_of(table, chosen), flag_sentences_of(table, chosen.file.exclude_flags)
+        table = trial_table(
+            cell_pieces(trials),
+            chosen.file,
+            material,
+            source=str(trials),
+            others=False,
+            say=lambda rows: say("rows read", rows),
+        )
+    return chosen, cohort_of(table, chosen), flag_sentences_of(table.flags, chosen.file.exclude_flags)
 
 
 def _only_material(trials: Path, study: Any) -> str | None:

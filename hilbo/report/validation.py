@@ -25,7 +25,7 @@ from hilbo.statistics.regression import Regression
 from hilbo.study.config import Study
 from hilbo.study.formats.csv_file import read_cells
 from hilbo.study.formats.json_file import Content
-from hilbo.study.tables.flag_counts import flag_sentences_of
+from hilbo.study.tables.flag_counts import flag_counts, flag_sentences_of
 from hilbo.study.tables.validation import RESPONSES, TIE, check_validation, of_material, read_validation, sets_frame
 
 __all__ = [
@@ -228,7 +228,7 @@ def write_validation(
         pictures = save_figures(validation_figures(validated), material_folder)
         contents.append(validation_content(validated))
         sections.append(validation_section(validated) | {"figures": pictures})
-    flags = flag_sentences_of(table, study.file.exclude_flags, "comparisons")
+    flags = flag_sentences_of(flag_counts(table), study.file.exclude_flags, "comparisons")
     content = {"materials": contents, "study": study.file.hash, "seed": seed, "versions": versions()}
     content["warnings"] = [*flags, *named_warnings(dict(zip(names, contents, strict=True)))]
     write_result(content, folder)

@@ -21,11 +21,14 @@ from hilbo.ordinal_gp import Trials
 from hilbo.population.rules.registry import RULES
 from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
-from hilbo.study.tables.trials import checked_trials, is_checked, trial_table
+from hilbo.study.formats.csv_file import FRAME, cell_pieces, cells_of
+from hilbo.study.tables.trials import TrialTable, check_recoding, trial_table
 
 __all__ = ["Cohort", "cohort_of", "read_trials"]
 
 _LEVELS = 200  # of a random effect
+_CATEGORIES = "hilbo's column category"
+"""Of a DataFrame's attributes, the one that tells the column that `read_trials` added from one of the user's own."""
 
 
 class Cohort(eqx.Module):
@@ -105,20 +108,21 @@ def read_trials(
     the columns that hilbo does not use. `say`: called with the number of rows read so far. `note`: called with a
     sentence on participants without a response that counts; by default a warning. Raises `InputError`.
     """
-    return trial_table(path, study.file, material, others=others, say=say, note=note)
+    cells = cell_pieces(path)
+    table = trial_table(cells, study.file, material, source=str(path), others=others, say=say, note=note)
+    table.rows.attrs[_CATEGORIES] = True
+    return table.rows
 
 
-def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:
-    """Participants from a trial table: one that `tables.trials.read_trials` made, whose rows stay in their order, that
-    of the answers; or a DataFrame of yours with the same columns, which is checked and put in order as a file is. So
-    is one that `read_trials` made and you changed.
+def cohort_of(table: TrialTable | pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:
+    """The participants of a trial table: one that was checked against this study, or a DataFrame with its columns,
+    such as `read_trials` makes, which is checked as a file is.
 
-    `capacity` defaults to the study's number of trials, or to the most answers of a participant if that is more.
-    Raises `InputError` for a table that is none of the study's, and a `capacity` that somebody's answers exceed.
+    `capacity` defaults to the study's number of trials, or to the most responses of a participant if that is more.
+    Raises `InputError` for a table that is none of the study's, and a `capacity` that somebody's responses exceed.
     """
-    if not isinstance(table, pd.DataFrame) or not is_checked(table, study.file):
-        table = checked_trials(_as_in_a_file(table, study), study.file)
-    person, names = pd.factorize(table["participant"])
+    answers = (table if isinstance(table, TrialTable) else _checked(table, study)).rows
+    person, names = pd.factorize(answers["participant"])
     counts = np.bincount(person)
     longest = int(counts.max())
     capacity = max(longest, study.file.selection.trials) if capacity is None else capacity
@@ -128,20 +132,20 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     rank = np.arange(len(person)) - np.repeat(np.cumsum(counts) - counts, counts)
     rows = person[order], rank
     physical = np.full((len(counts), capacity, study.space.dim), np.nan)
-    physical[rows] = table[list(study.space.names)].to_numpy(float)[order]
-    answers = np.zeros((len(counts), capacity), np.int32)
-    answers[rows] = table["category"].to_numpy()[order]
+    physical[rows] = answers[list(study.space.names)].to_numpy(float)[order]
+    categories = np.zeros((len(counts), capacity), np.int32)
+    categories[rows] = answers["category"].to_numpy()[order]
     held = np.arange(capacity)[None, :] < counts[:, None]
     middle = [(p.low + p.high) / 2 for p in study.space.parameters]
     x = _to_unit(study.space, np.where(held[..., None], physical, middle))
-    asked = _asked(table.iloc[order], rows, held.shape)
-    texts = _random_effect(table, study)
+    asked = _asked(answers.iloc[order], rows, held.shape)
+    texts = _random_effect(answers, study)
     if texts is None:
-        return Cohort(jax.vmap(Trials)(x, to_device(answers), to_device(held)), physical, tuple(names), (), *asked)
+        return Cohort(jax.vmap(Trials)(x, to_device(categories), to_device(held)), physical, tuple(names), (), *asked)
     levels, contexts = pd.factorize(texts, sort=True)
     context = np.zeros((len(counts), capacity), np.int32)
     context[rows] = levels[order]
-    trials = jax.vmap(Trials)(x, to_device(answers), to_device(held), to_device(context))
+    trials = jax.vmap(Trials)(x, to_device(categories), to_device(held), to_device(context))
     return Cohort(trials, physical, tuple(names), tuple(contexts), *asked)
 
 
@@ -157,20 +161,21 @@ def _asked(
     return numbers, session, tuple(sessions)
 
 
-def _as_in_a_file(table: pd.DataFrame, study: Study) -> pd.DataFrame:
-    """Levels by their names where a table has their places, as one that `read_trials` made: no level's name is a
-    number, so that nothing is mistaken. And of a table with categories alone the answers that they are."""
-    if not isinstance(table, pd.DataFrame):
-        return table
-    words = {}
+def _checked(table: pd.DataFrame, study: Study) -> TrialTable:
+    """A DataFrame checked as a file is. In one that `read_trials` made levels are places in the list, which become
+    their names; no level's name is a number, so that nothing is mistaken. And categories may stand for responses."""
+    text = cells_of(table)
     for p in study.space.parameters:
         if p.levels and p.name in table and pd.api.types.is_numeric_dtype(table[p.name]):
-            places = table[p.name]
-            words[p.name] = places.map(dict(enumerate(p.levels))).astype(object).fillna(places.astype(object))
+            names = table[p.name].map(dict(enumerate(p.levels)))
+            text[p.name] = text[p.name].mask(names.notna().to_numpy(), names.to_numpy())
     if "response" not in table and "category" in table and pd.api.types.is_integer_dtype(table["category"]):
-        answers = table["category"].map(dict(enumerate(study.responses)))
-        words |= {"response": answers} if answers.notna().all() else {}  # a number beyond them may look like a rank
-    return table.assign(**words)
+        responses = table["category"].map(dict(enumerate(study.responses)))
+        if responses.notna().all():  # a number beyond them may look like a rank
+            text["response"] = responses.to_numpy()
+    elif _CATEGORIES in table.attrs and {"response", "category"} <= set(text.columns):
+        check_recoding(text, study.responses)
+    return trial_table([text], study.file, source=FRAME)
 
 
 def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:

@@ -13,7 +13,7 @@ or in the tables' column `material` alone, when they share everything. Whatever 
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,9 +26,9 @@ from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.departures import PHASE, Held, departures
 from hilbo.study.file.trial_flags import FlagCounts, flag_sentences
-from hilbo.study.formats.csv_file import numbers, parameter_values, read_cells
-from hilbo.study.tables.flag_counts import flag_counts, with_flag_counts
-from hilbo.study.tables.trials import NothingToFitError, check_texts, marked, ordered, trial_table
+from hilbo.study.formats.csv_file import cell_pieces, numbers, parameter_values, read_cells
+from hilbo.study.tables.flag_counts import flag_counts
+from hilbo.study.tables.trials import NothingToFitError, TrialTable, check_texts, joined, trial_table
 from hilbo.study.tables.validation import check_validation, sets_frame
 
 __all__ = ["Material", "StudyFolder", "read_folder"]
@@ -80,14 +80,15 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     sets = _sets(_table_paths(folder, "sets"), study)
     truth = _read_truth(truth_path, study) if truth_path.exists() else None
     compared = pd.concat(validation, ignore_index=True) if validation else None
-    names = _material_names(study, trials)
+    cells = {path: list(cell_pieces(path)) for path in trials}
+    names = _material_names(study, cells)
     tables = {
         folder / "validation.csv": compared,
         folder / "sets.csv": _rows_of_source(sets, "sysid"),
         truth_path: _rows_of_source(truth, "population"),
     }
     _check_materials_named(names, tables)
-    materials = [_material(name, study, trials, compared, sets, truth) for name in names]
+    materials = [_material(name, study, cells, compared, sets, truth) for name in names]
     departs, as_planned = _departures(folder, study, materials)
     limits = (*departs, *_missing_tables(study, materials, compared, sets))
     flags = flag_sentences(flag_counts(*validation), study.file.exclude_flags, "comparisons") if validation else []
@@ -134,21 +135,24 @@ def _validation(path: Path, study: Study) -> pd.DataFrame:
     )
 
 
-def _material_names(study: Study, paths: list[Path]) -> list[str]:
+def _materials_named(pieces: Iterable[pd.DataFrame]) -> list[str]:
+    """Materials of a table's rows; [""] if it has no such column."""
+    return list(dict.fromkeys(name for cells in pieces for name in cells.get("material", [""])))
+
+
+def _material_names(study: Study, tables: Mapping[Path, list[pd.DataFrame]]) -> list[str]:
     """Materials in the study's order, then in that of the tables; [""] if none is named anywhere."""
-    named = []
-    for path in paths:
-        cells = read_cells(path)
-        named += list(pd.unique(cells["material"])) if "material" in cells else [""]
+    named = [name for pieces in tables.values() for name in _materials_named(pieces)]
+    first = next(iter(tables))
     ordered = [name for name in study.file.materials if name in named] + [
         n for n in dict.fromkeys(named) if n not in study.file.materials
     ]
     if "" in ordered and len(ordered) > 1:
-        raise InputError(f"{paths[0]}: some rows name a material and some do not; name it in every row of every table.")
+        raise InputError(f"{first}: some rows name a material and some do not; name it in every row of every table.")
     unknown = [name for name in ordered if name and study.file.materials and name not in study.file.materials]
     if unknown:
         listed = ", ".join(study.file.materials)
-        raise InputError(f'{paths[0]}: material "{unknown[0]}" is not in the study file, which has {listed}.')
+        raise InputError(f'{first}: material "{unknown[0]}" is not in the study file, which has {listed}.')
     return ordered
 
 
@@ -170,38 +174,37 @@ def _check_materials_named(names: list[str], tables: Mapping[Path, pd.DataFrame 
 def _material(
     name: str,
     study: Study,
-    paths: list[Path],
+    tables: Mapping[Path, list[pd.DataFrame]],
     compared: pd.DataFrame | None,
     sets: pd.DataFrame | None,
     truth: pd.DataFrame | None,
 ) -> Material:
     """One material's rows of all tables, and its reference."""
     material_study = study.material(name) if name in study.file.materials else study
-    table = _answers(name, material_study, paths)
-    _check_answers_once(table, paths[0])
+    table = _answers(name, material_study, tables)
+    _check_answers_once(table.rows, next(iter(tables)))
     if compared is not None and name and "material" in compared:
         compared = compared[compared["material"] == name]
     reference, words = _reference(material_study, name, sets, truth)
     validation = None if compared is None or compared.empty else compared
-    cohort = cohort_of(marked(table, material_study.file), material_study)  # each table was checked as it was read
-    return Material(name, material_study, cohort, validation, reference, words, flag_counts(table))
+    cohort = cohort_of(table, material_study)
+    return Material(name, material_study, cohort, validation, reference, words, table.flags)
 
 
-def _answers(name: str, study: Study, paths: list[Path]) -> pd.DataFrame:
+def _answers(name: str, study: Study, tables: Mapping[Path, list[pd.DataFrame]]) -> TrialTable:
     """A material's answers in all tables. Somebody who stopped in the warm-up may have a table without any."""
-    tables, empty = [], []
-    for path in paths:
-        cells = read_cells(path)
-        if name in (set(cells["material"]) if "material" in cells else {""}):
+    read, empty = [], []
+    for path, pieces in tables.items():
+        if name in _materials_named(pieces):
             try:
-                tables.append(trial_table(path, study.file, name or None, others=False))
+                read.append(trial_table(pieces, study.file, name or None, source=str(path), others=False))
             except NothingToFitError as error:
                 empty.append(error)
-    if not tables:
+    if not read:
         raise empty[0]
     for error in empty:
         warn_caller(f"{error} It is left out.")
-    return with_flag_counts(ordered(pd.concat(tables, ignore_index=True)), flag_counts(*tables))
+    return joined(read)
 
 
 def _check_answers_once(table: pd.DataFrame, path: Path) -> None:

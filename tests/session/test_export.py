@@ -85,8 +85,8 @@ def test_logs_and_exported_table_give_the_same_bits(folder, tmp_path):
     path = out / "data" / "study-plain_table-trials_data.csv"
     notes = []
     direct, exported = (
-        read_log_trials(folder, STUDY.file, note=notes.append),
-        read_trials(path, STUDY, note=notes.append),
+        read_log_trials(folder, STUDY.file, note=notes.append).rows.reset_index(drop=True),
+        read_trials(path, STUDY, note=notes.append).reset_index(drop=True),
     )
     of_logs, of_table = (note.partition(": ") for note in notes)
     assert (of_logs[0], of_table[0]) == (str(folder), str(path)) and of_logs[2] == of_table[2]
@@ -131,7 +131,7 @@ def test_netcdf_is_read_by_xarray_and_arviz(folder, tmp_path):
     tree = xr.open_datatree(path, engine="h5netcdf").load()
     assert tree["observed_data"]["category"].sizes == {"obs_id": 12}  # without the repetition, which is never fitted
     data = arviz.from_netcdf(str(path))
-    table = read_log_trials(folder, STUDY.file)
+    table = read_log_trials(folder, STUDY.file).rows
     assert set(data.constant_data["phase"].values) == {"optimisation"}
     assert sorted(data.constant_data["u"].values) == sorted(table["u"])
     assert data.observed_data["category"].values.sum() == table["category"].sum()
@@ -151,7 +151,7 @@ def test_one_participant_is_deleted_from_everything(folder, tmp_path):
     for path in tmp_path.rglob("*"):
         if path.suffix in (".csv", ".jsonl"):
             assert "P02" not in path.read_text()
-    assert set(read_log_trials(folder, STUDY.file)["participant"]) == {"P01"}
+    assert set(read_log_trials(folder, STUDY.file).rows["participant"]) == {"P01"}
     with pytest.raises(InputError, match='nothing of participant "P02"'):
         delete_participant(tmp_path, "P02")
     with (
@@ -186,10 +186,10 @@ def test_a_deletion_on_a_full_disk_changes_nothing(folder, monkeypatch, tmp_path
 
 
 def test_dry_runs_are_nobodys_answers(folder, tmp_path):
-    before, heard = read_log_trials(folder, STUDY.file), []
+    before, heard = read_log_trials(folder, STUDY.file).rows, []
     for session in ("1", "2"):
         write(folder, "test", "optimisation", session, dry_run=True)
-    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY.file, note=heard.append), before)
+    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY.file, note=heard.append).rows, before)
     assert heard[0] == f"{folder}: 2 dry runs are left out." and len(heard) == 2  # the other is of who validated
     assert {state.header.participant for state in read_sessions(folder, STUDY.file)} == {"P01", "P02", "P03"}
     write(tmp_path / "dry", "test", "optimisation", "1", dry_run=True)
@@ -199,12 +199,12 @@ def test_dry_runs_are_nobodys_answers(folder, tmp_path):
 
 def test_a_log_that_lacks_its_last_newline_is_whole_and_one_cut_off_is_said(folder):
     heard = []
-    before = read_log_trials(folder, STUDY.file, note=heard.append)  # P03 has no answer that counts, and that is said
+    before = read_log_trials(folder, STUDY.file, note=heard.append).rows  # P03 has no answer that counts
     path, same = folder / "P01_1.session.jsonl", list(heard)
     heard.clear()
     whole = path.read_bytes()
     path.write_bytes(whole[:-1])
-    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY.file, note=heard.append), before)
+    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY.file, note=heard.append).rows, before)
     assert heard == same
     heard.clear()
     path.write_bytes(whole[:-9])
@@ -214,7 +214,7 @@ def test_a_log_that_lacks_its_last_newline_is_whole_and_one_cut_off_is_said(fold
     assert sentence.startswith(f"{path}:{last}: the last line is cut off, and is left out;")
     heard.clear()
     path.write_bytes(b"")  # a copy onto a full disk
-    assert set(read_log_trials(folder, STUDY.file, note=heard.append)["participant"]) == {"P02"}
+    assert set(read_log_trials(folder, STUDY.file, note=heard.append).rows["participant"]) == {"P02"}
     sentence, _ = heard
     assert sentence.startswith(f"{path}: has no whole first line, and is left out;")
 
@@ -243,9 +243,9 @@ def test_answers_of_hilbo_try_are_marked_and_not_read_beside_others(folder, tmp_
     with pytest.raises(InputError, match="is an unblinded answer, as hilbo try gives"):
         read_log_trials(folder, STUDY.file)
     write(tmp_path / "own", "try-1", "optimisation", "1", unblinded="try")
-    assert set(read_log_trials(tmp_path / "own", STUDY.file)["participant"]) == {"try-1"}
+    assert set(read_log_trials(tmp_path / "own", STUDY.file).rows["participant"]) == {"try-1"}
     (folder / "try-1_1.session.jsonl").unlink()
-    assert "unblinded" not in read_log_trials(folder, STUDY.file)
+    assert "unblinded" not in read_log_trials(folder, STUDY.file).rows
 
 
 def test_folders_without_answers_are_refused(tmp_path):

@@ -1,5 +1,6 @@
 """The folder that `hilbo report` reads: materials, references, several tables; bad folders in one sentence."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,18 @@ def test_the_report_never_replaces_what_it_reads(capsys, monkeypatch, tmp_path):
         "--force",
     )
     assert code == 2 and "is not a result of hilbo's" in stderr  # data without a result beside it
+
+
+def test_a_trial_table_is_read_once_whatever_the_number_of_materials(tmp_path):
+    trials = "material," + HEAD + "".join(f"{name},A,1,close,5,6,0.2\n" for name in "xyz")
+    folder, opened = folder_with(tmp_path, trials__csv=trials), []
+
+    def count(event, arguments):
+        if event == "open" and str(arguments[0]) == str(folder / "trials.csv"):
+            opened.append(event)
+
+    sys.addaudithook(count)  # which stays, and looks for this one file
+    assert len(read_folder(folder).materials) == 3 and len(opened) == 1
 
 
 def test_materials_have_their_own_references(tmp_path):

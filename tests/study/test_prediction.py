@@ -15,7 +15,6 @@ from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.estimate.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.file.reserved_names import is_reserved
 from hilbo.study.results.arviz_groups import groups, inference_data
-from hilbo.study.tables.trials import checked_trials
 
 STUDY = Study.from_dict(PLAIN)
 LOW, HIGH = STUDY.responses[0], STUDY.responses[-1]
@@ -75,7 +74,7 @@ def test_ones_own_table_is_a_cohort_with_the_bits_of_a_file(table, cohort, tmp_p
 )
 def test_what_is_wrong_with_ones_own_table_is_one_sentence(table, change, sentence):
     with pytest.raises(InputError) as refused:
-        checked_trials(change(table), STUDY.file)
+        cohort_of(change(table), STUDY)
     assert str(refused.value).startswith(sentence)
 
 

@@ -12,6 +12,7 @@ from hilbo.errors import InputError, InputRemark
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.file.trial_flags import FLAGS, flag_sentences, flag_words
 from hilbo.study.folder import read_folder
+from hilbo.study.formats.csv_file import cell_pieces
 from hilbo.study.tables.flag_counts import flag_counts
 from hilbo.study.tables.trials import NothingToFitError, trial_table
 from hilbo.study.tables.validation import check_validation, read_validation
@@ -47,17 +48,18 @@ B,2,close,0.6,optimisation,odd,700
 def read(folder, text=TABLE, rule=RULE, **options):
     (folder / "study.toml").write_text(TOML.format(rule=rule))
     (folder / "trials.csv").write_text(text)
-    return trial_table(folder / "trials.csv", StudyFile.load(folder / "study.toml"), **options)
+    path = folder / "trials.csv"
+    return trial_table(cell_pieces(path), StudyFile.load(folder / "study.toml"), source=str(path), **options)
 
 
 def trials(table):
-    return list(zip(table["participant"], table["trial"], strict=True))
+    return list(zip(table.rows["participant"], table.rows["trial"], strict=True))
 
 
 def test_flagged_trials_are_left_out_and_counted(tmp_path):
     table = read(tmp_path, others=False)
     assert trials(table) == [("A", 1), ("A", 3), ("A", 4), ("B", 2)]
-    counts = flag_counts(table)
+    counts = table.flags
     assert counts.content() == {"recorded": 5, "flagged": {"saturated": 1, "slewed": 2, "controlled": 1}, "left_out": 2}
     assert flag_sentences(counts, ("saturated", "slewed")) == [
         "Device flags were recorded for 5 trials (saturated 1, slewed 2, controlled 1); excluded by [study]"
@@ -67,8 +69,8 @@ def test_flagged_trials_are_left_out_and_counted(tmp_path):
 
 def test_without_the_key_every_trial_is_fitted_and_the_digest_is_as_before(tmp_path):
     table = read(tmp_path, rule="")
-    assert len(table) == 6 and flag_counts(table).left_out == 0
-    (said,) = flag_sentences(flag_counts(table), ())
+    assert len(table.rows) == 6 and table.flags.left_out == 0
+    (said,) = flag_sentences(table.flags, ())
     assert said.endswith("(saturated 1, slewed 2, controlled 1); no trial is excluded.")
     assert StudyFile.load(tmp_path / "study.toml").hash == "e39dc5a71740fb33"  # as before there was such a key
     empty = PLAIN | {"study": PLAIN["study"] | {"exclude_flags": []}}
@@ -78,10 +80,10 @@ def test_without_the_key_every_trial_is_fitted_and_the_digest_is_as_before(tmp_p
 
 def test_a_table_without_a_record_of_flags_is_read_and_that_is_said(tmp_path):
     table = read(tmp_path, "participant,trial,response,u\nA,1,close,0.1\n")
-    assert len(table) == 1
-    (said,) = flag_sentences(flag_counts(table), ("hold",))
+    assert len(table.rows) == 1
+    (said,) = flag_sentences(table.flags, ("hold",))
     assert said == "No device flags were recorded for these trials; [study] exclude_flags (hold) excludes none."
-    assert flag_sentences(flag_counts(table), ()) == []
+    assert flag_sentences(table.flags, ()) == []
 
 
 def test_whoever_has_no_other_answer_is_named(tmp_path):

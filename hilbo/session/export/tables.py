@@ -3,12 +3,10 @@
 `trials_table` is a trial table (every answer to one rendering; voided and undone ones marked so), `validation_table`
 and `sets_table` are those of `hilbo.study.tables.validation` (voided comparisons left out), `presentations_table` has
 every trial that was ever proposed, and what became of it, `sessions_table` the plan that each session was held by.
-`read_log_trials` reads a folder of logs as `hilbo.study.tables.trials.trial_table` reads the exported table, through
-the very same text, so that both give the same bits.
+`read_log_trials` checks the texts of these cells as those of a file are, so that both give the same bits.
 """
 
 import os
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,8 +23,9 @@ from hilbo.session.log.state import LiveSession
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES, SAMPLES, flag_words
 from hilbo.study.formats.cell_text import runs_in_a_spreadsheet
+from hilbo.study.formats.csv_file import cells_of
 from hilbo.study.tables.parameter_sets import role_of, source_of
-from hilbo.study.tables.trials import trial_table, write_trials
+from hilbo.study.tables.trials import TrialTable, trial_table
 
 __all__ = [
     "computes_sets",
@@ -203,26 +202,14 @@ def read_log_trials(
     material: str | None = None,
     *,
     others: bool = True,
-    say: Callable[[int], None] = lambda rows: None,
     note: Callable[[str], object] = lambda sentence: None,
-) -> pd.DataFrame:
-    """As `hilbo.study.tables.trials.trial_table`, from a folder of session logs; `study` is the whole one, of all
-    materials."""
+) -> TrialTable:
+    """The trial table of a folder of session logs; `study` is the whole one, of all materials. See `trial_table`."""
     table = trials_table(read_sessions(folder, study, note))
     if table.empty:
         raise InputError(f"{folder}: its sessions hold no answers yet; nothing can be aggregated.")
     chosen = study.material(material) if material and study.materials else study
-    with tempfile.TemporaryDirectory() as made:
-        path = Path(made) / "trials.csv"
-        write_trials(table, path)
-
-        def note_of_logs(sentence: str) -> None:
-            note(sentence.replace(str(path), str(folder)))
-
-        try:
-            return trial_table(path, chosen, material, others=others, say=say, note=note_of_logs)
-        except InputError as error:
-            raise InputError(str(error).replace(str(path), str(folder))) from None
+    return trial_table([cells_of(table)], chosen, material, source=str(folder), others=others, note=note)
 
 
 def _written(text: Any) -> Any:

@@ -113,10 +113,11 @@ def _as_text(frame: pd.DataFrame, first_row: int) -> pd.DataFrame:
 
 
 def _column_as_text(column: pd.Series) -> list[str]:
-    """Each cell with the fewest digits that are this number in the column's own precision: 0.99 of a float32 column is
-    0.99, and no number above it."""
+    """Each cell, empty where it is missing, with the fewest digits that are this number in the column's own precision:
+    0.99 of a float32 column is 0.99, and no number above it."""
     narrow = column.dtype.kind == "f" and getattr(column.dtype, "itemsize", 8) < 8  # a sparse dtype has no size
-    return ["" if v is None or v is pd.NA else str(v) for v in (column.to_numpy() if narrow else column.tolist())]
+    values = column.to_numpy() if narrow else column.tolist()
+    return ["" if missing else str(v) for v, missing in zip(values, column.isna().tolist(), strict=True)]
 
 
 def _csv_pieces(path: Path, source: str, needs: str) -> Iterator[pd.DataFrame]:

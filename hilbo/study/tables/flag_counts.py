@@ -1,13 +1,13 @@
 """Flags of the device in tables of answers: which rows carry one, and how many do (`hilbo.study.file.trial_flags`)."""
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 import pandas as pd
 
 from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES, FLAGS, FlagCounts, flag_sentences
 
-__all__ = ["counted_flags", "flag_counts", "flag_sentences_of", "flagged", "with_flag_counts"]
+__all__ = ["added", "counted_flags", "flag_counts", "flag_sentences_of", "flagged", "with_flag_counts"]
 
 _COUNTS = "hilbo flags"
 """Of the attributes that pandas carries along with a table, the one that holds its `FlagCounts`."""
@@ -41,18 +41,21 @@ def with_flag_counts(table: pd.DataFrame, counts: FlagCounts) -> pd.DataFrame:
 
 
 def flag_counts(*tables: pd.DataFrame) -> FlagCounts:
-    """The counts that tables carry, together."""
-    each = [table.attrs.get(_COUNTS, FlagCounts()) for table in tables]
+    """The counts that tables of comparisons carry, together."""
+    return added(table.attrs.get(_COUNTS, FlagCounts()) for table in tables)
+
+
+def added(parts: Iterable[FlagCounts]) -> FlagCounts:
+    """The counts of several tables together."""
+    each = list(parts)
     total = sum((Counter(counts.flagged) for counts in each), Counter())
     flags = {name: total[name] for name in FLAGS if total[name]}
     excluded = sum((Counter(counts.excluded) for counts in each), Counter())
     return FlagCounts(sum(c.recorded for c in each), flags, excluded)
 
 
-def flag_sentences_of(table: pd.DataFrame, exclude: Collection[str], what: str = "trials") -> list[str]:
-    """The sentences of `flag_sentences` for a table that carries its counts; nothing where no trial carries a flag and
-    none is excluded."""
-    counts = flag_counts(table)
+def flag_sentences_of(counts: FlagCounts, exclude: Collection[str], what: str = "trials") -> list[str]:
+    """The sentences of `flag_sentences`; nothing where no trial carries a flag and none is excluded."""
     return flag_sentences(counts, exclude, what) if counts.flagged or exclude else []
 
 

@@ -8,44 +8,40 @@ is one sentence with the file and the line (Parquet: row). A table is read piece
 when its numbers are known.
 """
 
-import hashlib
 import os
 import re
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError, warn_caller
 from hilbo.study.file.reading import StudyFile
-from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES
+from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES, FlagCounts
 from hilbo.study.formats.cell_text import FORMULA_WORDS, ID_WORDS, but_for_case, check_text, formulas, no_ids
 from hilbo.study.formats.csv_file import (
     FRAME,
     answer_forms,
-    cell_pieces,
-    cells_of,
     numbers,
     parameter_values,
     place,
     refuse,
 )
-from hilbo.study.tables.flag_counts import counted_flags, flagged, with_flag_counts
+from hilbo.study.tables.flag_counts import added, counted_flags, flagged
 
 __all__ = [
     "NOT_FITTED",
     "NothingToFitError",
+    "TrialTable",
     "check_people",
+    "check_recoding",
     "check_texts",
-    "checked_trials",
     "flags",
-    "is_checked",
     "is_fitted",
-    "marked",
+    "joined",
     "of_material",
-    "ordered",
     "trial_table",
     "write_trials",
 ]
@@ -58,56 +54,41 @@ class NothingToFitError(InputError):
 NOT_FITTED = ("warm-up", "repeat")
 """Phases whose answers are kept and never fitted: familiarisation, and repetitions that check consistency."""
 _KEY = ("participant", "session", "phase", "material", "trial")
-_MARK = "hilbo checked"
-"""Of the attributes that pandas carries along with a table, the one that says what was checked."""
 _TRUE = {"1", "1.0", "1,0", "true", "yes"}
 _NAMED = 6  # people of whom a remark says the names
 _MISSING = {"", "nan", "none", "<na>"}
 _FALSE = {"", "0", "0.0", "0,0", "false", "no", "nan", "none", "<na>"}
 
 
+class TrialTable(NamedTuple):
+    """A trial table that was checked against a study: the rows to be fitted, by participant, session and trial."""
+
+    rows: pd.DataFrame
+    """With the column `category` (0 = lowest response); of a level its place in the list."""
+    flags: FlagCounts
+    """Trials that carry a flag of the device, and those that the study excludes for theirs."""
+
+
 def trial_table(
-    path: str | os.PathLike,
+    cells: Iterable[pd.DataFrame],
     study: StudyFile,
     material: str | None = None,
     *,
-    others: bool = True,
-    say: Callable[[int], None] = lambda rows: None,
-    note: Callable[[str], object] = warn_caller,
-) -> pd.DataFrame:
-    """The rows of a trial table that are to be fitted, in the order of their keys within each participant.
-
-    Adds the column `category` (0 = lowest response). Warm-up, repeated and voided rows are checked and left out, and
-    so are those with a flag that the study excludes; the table carries their counts (`flag_counts.flag_counts`).
-    `material` selects the rows of one material, and must be given if there are several. `others`: keep the columns that
-    are nobody's business. `say` is told how many rows have been read, and `note` who has no answer that
-    counts: a warning, if nothing else is given. Raises `InputError`.
-    """
-    return _read(cell_pieces(path), study, material, str(path), others, say, note)
-
-
-def checked_trials(frame: pd.DataFrame, study: StudyFile, material: str | None = None) -> pd.DataFrame:
-    """As `read_trials`, from a table in memory: the same columns, the same checks. Raises `InputError` with the same
-    sentences."""
-    text = cells_of(frame)
-    for column in text.columns.intersection(_KEY):
-        text.loc[frame[column].isna().to_numpy(), column] = ""  # a missing participant is nobody called "nan"
-    if _MARK in frame.attrs and {"response", "category"} <= set(text.columns):
-        _check_recoding(text, study.responses)
-    return _read([text], study, material, FRAME, True, lambda rows: None, warn_caller)
-
-
-def _read(
-    whole: Iterable[pd.DataFrame],
-    study: StudyFile,
-    material: str | None,
     source: str,
-    others: bool,
-    say: Any,
-    note: Any,
-) -> pd.DataFrame:
+    others: bool = True,
+    say: Callable[[int], object] = lambda rows: None,
+    note: Callable[[str], object] = warn_caller,
+) -> TrialTable:
+    """The checked table of these cells, which come as text, piece by piece (`csv_file.cell_pieces`, `cells_of`).
+
+    Warm-up, repeated and voided rows, and those with a flag that the study excludes, are checked and left out.
+
+    **Arguments:** `material`: only its rows; needed if there are several. `source`: the file, for sentences. `others`:
+    keep the columns that hilbo does not use. `say`: called with the number of rows read so far. `note`: called with a
+    sentence on participants without a response that counts; by default a warning. Raises `InputError`.
+    """
     texts, pieces, rows, named = {}, [], 0, {}
-    for text in whole:
+    for text in cells:
         _check_columns(text, study, source)
         say(rows := rows + len(text))
         if material is not None and "material" in text:  # each material has ranges of its own
@@ -133,10 +114,16 @@ def _read(
     _note_the_absent(left, table, source if material is None else f"{source} ({material})", besides, note)
     if alike := but_for_case(table["participant"].unique()):
         note(f"{source}: {alike} differ in capitals only; they are taken for two people.")
-    return with_flag_counts(marked(ordered(table), study), counts)
+    return TrialTable(_ordered(table), counts)
 
 
-def ordered(table: pd.DataFrame) -> pd.DataFrame:
+def joined(tables: Sequence[TrialTable]) -> TrialTable:
+    """Several tables of one study as one."""
+    rows = pd.concat([table.rows for table in tables], ignore_index=True)
+    return TrialTable(_ordered(rows), added(table.flags for table in tables))
+
+
+def _ordered(table: pd.DataFrame) -> pd.DataFrame:
     """A checked table, or several as one, by participant, session and trial; where a session has a number in several
     phases, by phase before."""
     keys = [name for name in ("participant", "session") if name in table]
@@ -158,31 +145,6 @@ def _note_the_absent(
         have = "has" if len(absent) == 1 else "have"
         also = f"voided, warm-up or repeated{besides}, and not fitted"
         note(f"{source}: {answers} {also}; {who} {have} no other answer in it.")
-
-
-def marked(table: pd.DataFrame, study: StudyFile) -> pd.DataFrame:
-    """The table, marked as checked against this study. pandas carries the mark along; `is_checked` compares it with
-    what then stands in the table."""
-    table.attrs[_MARK] = _digest(table, study)
-    return table
-
-
-def is_checked(table: pd.DataFrame, study: StudyFile) -> bool:
-    """Whether `read_trials` or `checked_trials` made the table for such a study, and nobody has changed it since."""
-    try:
-        return _MARK in table.attrs and table.attrs[_MARK] == _digest(table, study)
-    except TypeError:  # of cells that cannot be told apart, such as lists, which no check lets pass
-        return False
-
-
-def _digest(table: pd.DataFrame, study: StudyFile) -> str:
-    """Of what fits take from a table, its rows in their order, and of what the study asks of it."""
-    columns = {*_KEY, "response", "category", "voided", "unblinded", study.random_effect, *study.space.names}
-    held = table.loc[:, [column for column in table.columns if column in columns]]
-    asked = study.responses, study.space.parameters, study.random_effect, study.stimulus and study.stimulus.unblinded
-    head = repr((asked, list(held.columns), [str(dtype) for dtype in held.dtypes]))
-    rows = pd.util.hash_pandas_object(held, index=False).to_numpy()
-    return hashlib.sha256(head.encode() + rows.tobytes()).hexdigest()
 
 
 def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
@@ -256,9 +218,9 @@ def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.S
     return categories.astype(int)
 
 
-def _check_recoding(text: pd.DataFrame, responses: Sequence[str]) -> None:
-    """Refuse a table that `read_trials` made in which somebody changed `category` and left `response` as it was, or the
-    reverse: the fit would be to one of them, without a word."""
+def check_recoding(text: pd.DataFrame, responses: Sequence[str]) -> None:
+    """Refuse cells in which `category` is not that of `response`: only one of them was changed by whoever read them,
+    and the fit would be to the other."""
     categories = _categories(text["response"], responses, FRAME)
     refuse(
         pd.to_numeric(text["category"], errors="coerce") != categories,
