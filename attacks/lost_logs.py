@@ -67,7 +67,7 @@ def lost_log_case() -> Callable[[random.Random, int], str]:
         name = list(FAULTS)[number % len(FAULTS)]
         folder = root / str(number)
         path = folder / "logs" / log_name(driver.header)
-        with EventLog.create(path, STUDY, driver.header) as log:
+        with EventLog.create(path, STUDY.file, driver.header) as log:
             fault = threading.Timer(rng.random() * 0.02, FAULTS[name], [path])
             fault.start()
             acknowledged, error = _appended(log, driver.events, fault)
@@ -104,7 +104,7 @@ def _kept(folder: Path) -> list[int]:
     for path in folder.rglob("*"):
         if path.is_file():
             try:
-                found.append(len(read_log(path, STUDY)[1]))
+                found.append(len(read_log(path, STUDY.file)[1]))
             except InputError:
                 continue
     return found
