@@ -45,9 +45,9 @@ def test_a_hand_that_stays_interrupts_the_trial_and_nothing_is_forced(tmp_path, 
     session = LiveFake(tmp_path, pressed=not late)
     send = session.fake.send
 
-    def come_back(**numbers):
+    def come_back(*parameter_set, **numbers):
         session.fake.pressed = True
-        return send(**numbers)
+        return send(*parameter_set, **numbers)
 
     if late:
         monkeypatch.setattr(session.fake, "send", come_back)
