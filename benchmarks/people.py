@@ -42,7 +42,10 @@ from hilbo.population.newcomer import class_probabilities  # noqa: E402
 from hilbo.population.pointwise import aggregate  # noqa: E402
 from hilbo.population.rules.recipes import LEARNT_1, LEARNT_2  # noqa: E402
 from hilbo.population.rules.registry import POINTWISE, RECIPES  # noqa: E402
-from hilbo.population.shared.counts import Counts, fit_counts  # noqa: E402
+from hilbo.population.shared.features import pivots_of  # noqa: E402
+from hilbo.population.shared.people_model import PeopleModel  # noqa: E402
+from hilbo.population.shared.posterior import shared_function  # noqa: E402
+from hilbo.population.shared.tallies import Tallies, fit_counts  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 WORDS = {
@@ -66,7 +69,8 @@ class Data:
         self.place = self.place.reshape(-1)
         counts = np.zeros((len(self.names), len(self.points), categories))
         np.add.at(counts, (self.who, self.place, q), 1.0)
-        self.counts = Counts(jnp.asarray(self.points), jnp.asarray(counts))
+        x = np.broadcast_to(self.points, (len(self.names), *self.points.shape))
+        self.counts = Tallies(jnp.asarray(x), jnp.asarray(counts))
         self.context = None if context is None else np.unique(context, return_inverse=True)[1]
 
     def trials(self, given, effect=False):
@@ -103,8 +107,7 @@ def start(data):
 @jax.jit
 def each(gp, counts):
     """Everybody's own posterior, stacked."""
-    one = jnp.ones(())
-    return jax.lax.map(lambda c: fit_counts(gp, one, Counts(counts.x, c[None])), counts.counts)
+    return jax.lax.map(lambda person: fit_counts(gp, *person), (counts.x, counts.counts))
 
 
 @jax.jit
@@ -118,10 +121,11 @@ def predicted(gp, share, counts, common, mask, x):
         part = share if rule == "hierarchical" else None
         maps[rule] = aggregate(rule, means, explained, prior, share=part, mask=mask)
     maps["hierarchical"] = maps["hierarchical"][0], maps["hierarchical"][1] + (1 - share) * prior
-    mean, variance = fit_counts(gp, share, counts).predict(x)
+    model = PeopleModel.of(gp, share, len(counts.x))
+    pivots = pivots_of(model.unit, counts, counts.x.shape[1], 1e-14)
+    mean, variance = shared_function(model, counts, counts.blank, pivots).function.predict(x)
     maps["hierarchical, exact"] = mean, variance + (1 - share) * prior
-    pooled = Counts(counts.x, jnp.sum(counts.counts, axis=0, keepdims=True))
-    maps["pooled"] = fit_counts(gp, jnp.ones(()), pooled).predict(x)
+    maps["pooled"] = fit_counts(gp, counts.x[0], jnp.sum(counts.counts, axis=0)).predict(x)
     return {rule: jax.vmap(gp.likelihood.class_probabilities)(*moments) for rule, moments in maps.items()}
 
 
@@ -140,7 +144,7 @@ def main():
     for left in range(len(data.names)):
         mask = np.arange(len(data.names)) != left
         kept = jnp.asarray(mask[:, None, None] * 1.0)
-        counts = Counts(data.counts.x, data.counts.counts * kept)  # all shapes stay: one compilation
+        counts = Tallies(data.counts.x, data.counts.counts * kept)  # all shapes stay: one compilation
         learnt = learn_people(everybody.gp, counts, float(everybody.share), max_steps=40)
         shares.append(float(learnt.share))
         test = data.who == left

@@ -2,8 +2,8 @@
 
 For benchmarks/people.py, where rules without a recipe are to have the best hyperparameters that there are for them.
 
-All people's answers count together (`counts.evidence`): the prior variance of one person's function, of which the
-share p is common to all, the inverse squared lengths theta and the thresholds are learnt, in units of the
+All people's answers count together (`low_rank.shared_evidence`): the prior variance of one person's function, of which
+the share p is common to all, the inverse squared lengths theta and the thresholds are learnt, in units of the
 classification noise, which stays as it is (the scale of f is free). With the share held at 1 this is the pooled
 model's evidence, at 0 the sum of everybody's own. The search is L-BFGS on exact gradients, in the coordinates
 log theta, log variance, log noise, first threshold, log gaps, logit p.
@@ -21,11 +21,16 @@ from scipy.optimize import minimize
 
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.ordinal_gp import OrdinalGP
-from hilbo.population.shared.counts import Counts, evidence
+from hilbo.population.shared.features import pivots_of
+from hilbo.population.shared.low_rank import SharedEvidence, shared_evidence
+from hilbo.population.shared.people_model import PeopleModel
+from hilbo.population.shared.tallies import Tallies
 
-__all__ = ["LearntPeople", "learn_people"]
+__all__ = ["LearntPeople", "evidence", "learn_people"]
 
 _REFUSED = 1e3  # per answer: more than any answers cost
+_MOST = 256  # pivots
+_LEFT = 1e-9  # of the shared function's prior variance
 _REACH = 7.0  # coordinates stay so far from where they began: a factor of 1,100
 
 
@@ -42,7 +47,7 @@ class LearntPeople(eqx.Module):
 
 def learn_people(
     gp: OrdinalGP,
-    answers: Counts,
+    answers: Tallies,
     share: float = 0.8,
     *,
     learn: Sequence[str] = ("theta", "variance", "thresholds", "share"),
@@ -83,17 +88,26 @@ def _cost(
     rebuild: Callable[[Array], dict[str, Array]],
     gp: OrdinalGP,
     share: Float[Array, ""],
-    answers: Counts,
+    answers: Tallies,
 ) -> tuple[Float[Array, ""], Float[Array, " z"], Bool[Array, ""]]:
     """Minus the log evidence, its gradient, and whether both may be used."""
 
     def value(z):
         model, learnt_share = _model(rebuild(z), gp, share)
-        log_evidence, arrived = evidence(model, learnt_share, answers)
-        return -log_evidence, arrived
+        end = evidence(model, learnt_share, answers)
+        return -end.value, end.arrived
 
     (negative_evidence, arrived), slope = jax.value_and_grad(value, has_aux=True)(z)
     return negative_evidence, slope, arrived & jnp.isfinite(negative_evidence) & jnp.all(jnp.isfinite(slope))
+
+
+def evidence(gp: OrdinalGP, share: Float[Array, ""], answers: Tallies) -> SharedEvidence:
+    """Log evidence of all answers, differentiable once in `gp` and in `share`."""
+    model = PeopleModel.of(gp, share, len(answers.x))
+    room = min(answers.blank.size, _MOST)
+    return shared_evidence(
+        model, answers, answers.blank, pivots_of(jax.lax.stop_gradient(model.unit), answers, room, _LEFT)
+    )
 
 
 def _coordinates_of(learn: Sequence[str]) -> set[str]:

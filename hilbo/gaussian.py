@@ -24,6 +24,7 @@ __all__ = [
     "Scalar",
     "Vector",
     "certify",
+    "distance",
     "evidence_error",
     "evidence_known",
     "evidence_rounding",
@@ -32,6 +33,7 @@ __all__ = [
     "factorise",
     "inverse_and_log_determinant",
     "mean_and_explained",
+    "residual_tolerance",
     "shortfall",
     "square_root",
     "still",
@@ -192,6 +194,19 @@ def evidence_known(value: Scalar, error: Scalar, rounding: Scalar) -> Bool[Array
 def evidence_tolerance(log_evidence: Scalar) -> Scalar:
     """Tolerance of a log evidence: 0.02 + eps^(1/2) |log evidence|. Scalars, in nats."""
     return _NATS + jnp.finfo(log_evidence.dtype).eps ** 0.5 * jnp.abs(log_evidence)
+
+
+def distance(off: Float[Array, "..."], moved: Float[Array, "..."]) -> Scalar:
+    """A bound on sqrt(off' K off), from `off` and `moved`, K off: by how many of the prior's standard deviations
+    weights a with `off`, slope - a, are from the mode. It cannot be rounded to less than 0. Both of one shape."""
+    return jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(moved))
+
+
+def residual_tolerance(rounding: Float[Array, "..."]) -> Float[Array, "..."]:
+    """What the residual of a search for a mode or a fixed point has to reach: eps^(2/3), or the rounding error of the
+    residual itself, from the size `rounding` of its terms, where that is larger; eps^(1/4) at most."""
+    epsilon = jnp.finfo(rounding.dtype).eps
+    return jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
 
 
 def shortfall(certificate: Any, log_evidence: Scalar) -> str:

@@ -155,23 +155,11 @@ def plain_mode(terms: Terms, covariance: Matrix, start: Vector, max_steps: int) 
 
 def _whitened_mode(terms: Terms, covariance: Matrix, start: Vector, max_steps: int) -> Mode:
     """Find the mode by damped Newton steps in v, from the weights `start`."""
-    import optimistix as optx  # slow to import, and needed only where a fit is traced
-
-    from hilbo.newton_steps import DampedNewton
+    from hilbo.newton_steps import Whitened, climbed  # imports optimistix, which is slow
 
     root, changed = square_root(covariance)
-    solution = optx.root_find(
-        _stationarity,
-        DampedNewton(),
-        jnp.zeros_like(start),
-        (terms, covariance),
-        options={"root": root, "start": root.T @ start},
-        max_steps=max_steps,
-        throw=False,
-    )
-    state = solution.state
-    steps = jnp.asarray(solution.stats["num_steps"], jnp.int32)  # as EP counts them: one program serves both posteriors
-    return Mode(solution.value, state.residual, state.tolerance, steps, changed)
+    v, height, steps = climbed(Whitened(terms, root), root.T @ start, max_steps)
+    return Mode(root @ v, height.residual, height.tolerance, steps, changed)
 
 
 @find_mode.def_jvp

@@ -1,22 +1,23 @@
 """Newton's method for the mode of a log-concave posterior, as two root finders of optimistix.
 
-Full steps on the weights, and damped steps in whitened coordinates. A module of its own because optimistix is slow to
+Full steps on the weights, and damped steps in any coordinates. A module of its own because optimistix is slow to
 import: `hilbo.laplace` imports it only when a fit is traced.
 """
 
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int, PyTree
 
-from hilbo.gaussian import Matrix, Scalar, Vector, factorise
+from hilbo.gaussian import Matrix, Scalar, Vector, distance, factorise, residual_tolerance
 from hilbo.numerics.linalg import cholesky, solve_lower, solve_lower_transposed
 
-__all__ = ["DampedNewton", "FullNewton"]
+__all__ = ["Ascent", "DampedNewton", "FullNewton", "Height", "Whitened", "climbed"]
 
 Terms = Callable[[Vector], tuple[Vector, Vector, Vector]]
 """Log-likelihood terms, their slopes and curvatures, as `hilbo.laplace` has them."""
@@ -58,8 +59,7 @@ class FullNewton(optx.AbstractRootFinder):
         half = solve_lower(lower, (root * (covariance @ target))[:, None])
         following = target - root * solve_lower_transposed(lower, half)[:, 0]
         mismatch = slope - y
-        # |off| |K off| >= off' K off, and unlike it cannot be rounded to less than 0.
-        residual = jnp.sqrt(jnp.linalg.norm(mismatch) * jnp.linalg.norm(covariance @ mismatch))
+        residual = distance(mismatch, covariance @ mismatch)
         objective = jnp.sum(values) - 0.5 * y @ eta
         slack = 4.0 * jnp.finfo(y.dtype).eps * (jnp.sum(jnp.abs(values)) + jnp.abs(y @ eta))
         return following, _FullState(eta, objective, residual, objective >= state.objective - slack), None
@@ -76,26 +76,48 @@ class FullNewton(optx.AbstractRootFinder):
     @staticmethod
     def tolerance(dtype: DTypeLike) -> Scalar:
         """Tolerance of the residual, in standard deviations of the prior."""
-        return jnp.asarray(jnp.finfo(dtype).eps ** (2 / 3), dtype)
+        return residual_tolerance(jnp.zeros((), dtype))
 
 
-class _NewtonState(eqx.Module):
-    """Best point so far, and the step to be evaluated next."""
+class Height(eqx.Module):
+    """The log posterior at a point, and how far the point is from the mode."""
 
-    v: Vector  # the mode in whitened coordinates, eta = R v
-    direction: Vector
+    objective: Scalar
+    rounding: Scalar
+    """Rounding error of the objective."""
+    residual: Scalar
+    """A bound on the distance to the mode, in standard deviations of the prior."""
+    tolerance: Scalar
+    """What the residual has to reach."""
+
+
+@runtime_checkable
+class Ascent(Protocol):
+    """A concave log posterior in coordinates of some shape, in which Newton's steps are taken."""
+
+    def at(self, point: Array, /) -> tuple[Height, PyTree]:
+        """Its height at a point, and what else is known there."""
+        ...
+
+    def towards(self, point: Array, known: PyTree, /) -> tuple[Array, Scalar]:
+        """Newton's step from a point, and the rate of ascent along it."""
+        ...
+
+
+class _Search(eqx.Module):
+    """The height of the best point so far, and the step from it that is evaluated next."""
+
+    height: Height
+    direction: Array
     scale: Scalar  # of the next step along `direction`
     gain: Scalar  # rate of ascent along `direction`
-    objective: Scalar
-    residual: Scalar
-    tolerance: Scalar
 
 
 class DampedNewton(optx.AbstractRootFinder):
-    """Newton steps damped by Armijo's rule in whitened coordinates; one evaluation per iteration.
+    """Newton steps damped by Armijo's rule; one evaluation per iteration, the first of them at the start.
 
-    The point `v + scale * direction` is accepted if the log posterior rose by a fraction of the increase predicted by
-    the slope (beyond its own rounding), else the scale is halved. `options` hold the root R and the start v.
+    A step is accepted if the log posterior rose by a fraction of the increase predicted by the slope (beyond its own
+    rounding), else its scale is halved. `args` is an `Ascent`.
     """
 
     rtol: float = 0.0
@@ -103,56 +125,82 @@ class DampedNewton(optx.AbstractRootFinder):
     norm: Callable = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """Initial state at `options["start"]`, before any evaluation."""
-        del fn, args, f_struct, aux_struct, tags
+        """Initial state, before any evaluation."""
+        del fn, args, options, f_struct, aux_struct, tags
         infinite = jnp.asarray(jnp.inf, y.dtype)
         zero, one = jnp.zeros_like(infinite), jnp.ones_like(infinite)
-        return _NewtonState(options["start"], jnp.zeros_like(y), one, zero, -infinite, infinite, zero)
+        return _Search(Height(-infinite, zero, infinite, zero), jnp.zeros_like(y), one, zero)
 
     def step(self, fn, y, args, options, state, tags):
         """Evaluate the planned point; accept it, or halve the step."""
-        del fn, tags
-        root = options["root"]
-        trial = state.v + state.scale * state.direction
-        taken, slack = _newton_state(args[0], root, trial)
-        risen = taken.objective >= state.objective + 1e-4 * state.scale * state.gain - slack
+        del fn, options, tags
+        trial = y + state.scale * state.direction
+        reached, known = args.at(trial)
+        promised = state.height.objective + 1e-4 * state.scale * state.gain
+        risen = reached.objective >= promised - reached.rounding
+        direction, gain = jax.lax.cond(  # a factorisation, which neither the mode nor a step that is halved needs
+            risen & (reached.residual > reached.tolerance),
+            lambda: args.towards(trial, known),
+            lambda: (state.direction, state.gain),
+        )
         # A start without a finite objective ends the search.
-        halved = jnp.where(jnp.isfinite(state.objective), 0.5 * state.scale, 0.0)
-        refused = eqx.tree_at(lambda s: s.scale, state, halved)
-        state = jax.tree.map(lambda new, old: jnp.where(risen, new, old), taken, refused)
-        return jnp.where(risen, root @ trial, y), state, None
+        halved = jnp.where(jnp.isfinite(state.height.objective), 0.5 * state.scale, 0.0)
+        scale = jnp.where(risen, jnp.ones_like(halved), halved)
+        y, height = jax.tree.map(lambda new, old: jnp.where(risen, new, old), (trial, reached), (y, state.height))
+        return y, _Search(height, direction, scale, gain), None
 
     def terminate(self, fn, y, args, options, state, tags):
         """Whether the residual is below its tolerance, or the step has become negligible."""
         del fn, y, args, options, tags
-        return (state.residual <= state.tolerance) | (state.scale < 1e-12), optx.RESULTS.successful
+        ended = (state.height.residual <= state.height.tolerance) | (state.scale < 1e-12)
+        return ended, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, args, options, state, tags, result
         return y, aux, {}
 
 
-def _newton_state(terms: Terms, root: Matrix, v: Vector) -> tuple[_NewtonState, Scalar]:
-    """State at `v`: objective, residual with its tolerance, and next direction.
+def climbed(ascent: Ascent, start: Array, max_steps: int) -> tuple[Array, Height, Int[Array, ""]]:
+    """Where the damped steps from `start` end, the height there, and how many were tried, the start among them."""
+    solution = optx.root_find(_same, DampedNewton(), start, ascent, max_steps=max_steps, throw=False)
+    return solution.value, solution.state.height, jnp.asarray(solution.stats["num_steps"], jnp.int32)
 
-    Also the rounding error of the objective.
-    """
-    values, slope, curvature = terms(root @ v)
-    uphill = root.T @ slope - v
-    newton_matrix = jnp.eye(v.shape[0], dtype=v.dtype) + (root.T * curvature[None, :]) @ root
-    lower = cholesky(newton_matrix)
-    half = solve_lower(lower, uphill[:, None])
-    direction = solve_lower_transposed(lower, half)[:, 0]
-    epsilon, magnitude = jnp.finfo(v.dtype).eps, jnp.abs(root)
-    summed = magnitude.T @ (jnp.abs(slope) + curvature * (magnitude @ jnp.abs(v))) + jnp.abs(v)
-    state = _NewtonState(
-        v=v,
-        direction=direction,
-        scale=jnp.ones_like(v[0]),
-        gain=uphill @ direction,
-        objective=jnp.sum(values) - 0.5 * v @ v,
-        residual=jnp.linalg.norm(uphill),
-        tolerance=jnp.clip(4.0 * epsilon * jnp.linalg.norm(summed), epsilon ** (2 / 3), epsilon**0.25),
-    )
-    # Rounding of the values, and of R v times the slopes, which dominates at little noise.
-    return state, 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + 0.5 * v @ v + jnp.abs(slope) @ (magnitude @ jnp.abs(v)))
+
+def _same(point: Array, ascent: Ascent) -> Array:
+    """The solver looks at the ascent alone."""
+    del ascent
+    return point
+
+
+class Whitened(eqx.Module):
+    """The log posterior in v, eta = R v, in which it is strongly concave with modulus 1."""
+
+    terms: Terms
+    root: Matrix
+
+    def at(self, v: Vector) -> tuple[Height, tuple[Vector, Vector]]:
+        """The height at `v`, and the slope and the curvature there."""
+        root = self.root
+        values, slope, curvature = self.terms(root @ v)
+        uphill = root.T @ slope - v
+        epsilon, magnitude = jnp.finfo(v.dtype).eps, jnp.abs(root)
+        summed = magnitude.T @ (jnp.abs(slope) + curvature * (magnitude @ jnp.abs(v))) + jnp.abs(v)
+        # Rounding of the values, and of R v times the slopes, which dominates at little noise.
+        size = jnp.sum(jnp.abs(values)) + 0.5 * v @ v + jnp.abs(slope) @ (magnitude @ jnp.abs(v))
+        height = Height(
+            objective=jnp.sum(values) - 0.5 * v @ v,
+            rounding=4.0 * epsilon * size,
+            residual=jnp.linalg.norm(uphill),
+            tolerance=residual_tolerance(jnp.linalg.norm(summed)),
+        )
+        return height, (uphill, curvature)
+
+    def towards(self, v: Vector, known: tuple[Vector, Vector]) -> tuple[Vector, Scalar]:
+        """By the Cholesky factor of I + R'WR."""
+        uphill, curvature = known
+        root = self.root
+        newton_matrix = jnp.eye(v.shape[0], dtype=v.dtype) + (root.T * curvature[None, :]) @ root
+        lower = cholesky(newton_matrix)
+        half = solve_lower(lower, uphill[:, None])
+        direction = solve_lower_transposed(lower, half)[:, 0]
+        return direction, uphill @ direction

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from hilbo.gaussian import Matrix, Scalar, Vector, square_root
+from hilbo.gaussian import Matrix, Scalar, Vector, residual_tolerance, square_root
 from hilbo.inference.ep_sites import Joint, Sites, Tilted, coupling, joint_of, sites_of, solve
 from hilbo.laplace import plain_mode
 from hilbo.numerics.linalg import one_at_a_time
@@ -235,17 +235,16 @@ def _mismatch(
 ) -> tuple[Scalar, Scalar, Scalar]:
     """Residual and tolerance of the worse of mean and variance; mismatch (posterior sds) that controls the search."""
     tilted, natural, matched = means
-    epsilon = jnp.finfo(tilted.dtype).eps
     mean_gap = jnp.where(sites.precision > 0, jnp.abs(matched - tilted), 0.0)
     ratio = posterior.variance / (posterior.left * search.variance)
     log_ratio = jnp.where(sites.precision > 0, jnp.abs(jnp.log(ratio)), 0.0)
     prior = jnp.diagonal(covariance)
     residuals = jnp.stack([jnp.max(mean_gap / jnp.sqrt(prior)), jnp.max(log_ratio)])
-    tolerances = jnp.full((2,), epsilon ** (2 / 3), tilted.dtype)
+    rounding = jnp.zeros_like(residuals)
     if root is not None:  # the final fallback stops at its rounding error
         summed = jnp.abs(root).T @ (jnp.abs(natural) + sites.precision * jnp.abs(matched))
         rounding = jnp.stack([jnp.linalg.norm(summed), jnp.max(1.0 + sites.precision * search.variance)])
-        tolerances = jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
+    tolerances = residual_tolerance(rounding)
     worse = jnp.argmax(residuals / tolerances)
     mismatch = jnp.maximum(jnp.max(mean_gap / jnp.sqrt(posterior.variance)), residuals[1])
     return residuals[worse], tolerances[worse], mismatch

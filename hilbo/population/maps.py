@@ -2,9 +2,9 @@
 
 Rules of `pointwise` aggregate everybody's own posterior point by point. Two rules look at the answers themselves:
 
-* `hierarchical`, where the answers are few enough: the posterior of the shared function g, exact (`hierarchical`, or
-  `counts` where people answered the same stimuli); point by point otherwise, at the committee's cost.
-* `pooled`: the same with a share of 1, one function for all.
+* `hierarchical`, where the answers are few enough: the posterior of the shared function g, exact (`shared`); point by
+  point otherwise, at the committee's cost.
+* `pooled`: one function for all.
 * `learnt-1`, `learnt-2`: hierarchical, with hyperparameters that are learnt from the answers as well (`learnt`).
 
 The share that people have in common is learnt by evidence, from an even choice of people if there are many, and its
@@ -29,9 +29,11 @@ from hilbo.population import pointwise
 from hilbo.population.learnt.rule import Learnt, learnt_function
 from hilbo.population.newcomer import class_probabilities
 from hilbo.population.rules.registry import GIVEN, RULES
-from hilbo.population.shared.counts import Counts, counts_of, fit_counts, one_person
-from hilbo.population.shared.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
-from hilbo.population.shared.posterior import ContextEffects
+from hilbo.population.shared.features import every_point
+from hilbo.population.shared.hierarchical import Share, few_points, fit_people, learn_share, of_people, shared_posterior
+from hilbo.population.shared.people_model import PeopleModel
+from hilbo.population.shared.posterior import ContextEffects, shared_function
+from hilbo.population.shared.tallies import Tallies, fit_counts, tallied
 
 __all__ = [
     "LARGEST_EXACT",
@@ -46,7 +48,6 @@ __all__ = [
 LARGEST_EXACT = 1500
 """Answers, or latent values, up to which the exact models are used: they are cubic in their number."""
 _SHARE = 600  # answers from which the share is learnt
-_IN_ROWS = 4  # times as many rows as people is too many
 
 
 class RuleMap(eqx.Module):
@@ -157,6 +158,8 @@ def rule_map(
     """
     if rule not in GIVEN:
         raise InputError(f'rule_map: the rule is "{rule}"; it must be one of {", ".join(GIVEN)}.')
+    if not np.asarray(trials.mask).any():
+        raise InputError("rule_map: nobody gave an answer; at least one person's answers are needed.")
     prior = jnp.asarray(gp.kernel.variance)
     one = to_device(1.0, prior.dtype)
     if RULES[rule].learns_share:
@@ -188,31 +191,8 @@ def share_of(gp: OrdinalGP, trials: Trials, inference: str = "laplace", largest:
             'The rule "hierarchical" learns how people differ, and only'
             f' {len(answered)} of them gave an answer; use "bcm", whose map is then that person\'s.'
         )
-    inference = "ep" if inference == "exact" else inference
-    chosen = answered[even_rows(rows_of(trials, answered), largest)]
-    few = rows_of(trials, chosen)
-    counts = _counts_if_cheaper(gp, few, inference)
-    if counts is None:
-        return learn_share(gp, of_people(few), inference=inference)
-    counts = _among_all(counts, counts_of(trials, gp.likelihood.categories), chosen)
-
-    def evidence(share):
-        fitted = fit_counts(gp, share, counts)
-        certificate = fitted.certificate
-        return float(fitted.log_evidence), float(certificate.residual) <= float(certificate.tolerance)
-
-    return share_from(evidence, trials.x.dtype)
-
-
-def _among_all(counts: Counts, everybody: Counts, chosen: Int[np.ndarray, " k"]) -> Counts:
-    """The counts of the chosen people in the rows of all, of whom the others have none: the same result by the program
-    of everybody's map. As they are where the others were asked elsewhere, or are many."""
-    people = everybody.counts.shape[0]
-    if people > _IN_ROWS * len(chosen) or not np.array_equal(everybody.x, counts.x):
-        return counts
-    rows = np.zeros(everybody.counts.shape, counts.counts.dtype)
-    rows[chosen] = np.asarray(counts.counts)
-    return Counts(everybody.x, to_device(rows))
+    few = rows_of(trials, answered[even_rows(rows_of(trials, answered), largest)])
+    return learn_share(gp, few, "ep" if inference == "exact" else inference)
 
 
 def even_rows(trials: Trials, largest: int) -> Int[np.ndarray, " k"]:
@@ -226,16 +206,15 @@ def even_rows(trials: Trials, largest: int) -> Int[np.ndarray, " k"]:
 def _experts(gp: OrdinalGP, trials: Trials, inference: str) -> Posterior:
     """Everybody's own posterior, stacked; from counts where many answers are at the same points."""
     if inference == "laplace":
-        counts = counts_of(trials, gp.likelihood.categories)
-        if 2 * counts.x.shape[0] < trials.mask.shape[1]:
-            return _fit_people_from_counts(gp, counts)
+        answers = tallied(trials, gp.likelihood.categories)
+        if 2 * answers.x.shape[1] < trials.mask.shape[1]:
+            return _fit_people_from_counts(gp, answers)
     return _fit_people_from_trials(gp, trials, inference)
 
 
 @program
-def _fit_people_from_counts(gp: OrdinalGP, counts: Counts) -> Posterior:
-    one = jnp.ones_like(gp.kernel.variance)
-    return jax.lax.map(lambda person_counts: fit_counts(gp, one, Counts(counts.x, person_counts[None])), counts.counts)
+def _fit_people_from_counts(gp: OrdinalGP, answers: Tallies) -> Posterior:
+    return jax.lax.map(lambda person: fit_counts(gp, *person), (answers.x, answers.counts))
 
 
 @program
@@ -243,42 +222,28 @@ def _fit_people_from_trials(gp: OrdinalGP, trials: Trials, inference: str) -> Po
     return jax.vmap(lambda person: fit(gp, person, inference=inference, throw=False))(trials)
 
 
-def _counts_if_cheaper(gp: OrdinalGP, trials: Trials, inference: str) -> Counts | None:
-    """The answers as counts, where that is Laplace's model of them and the cheaper form of it."""
-    if inference != "laplace":
-        return None
-    answers = int(np.asarray(trials.mask).sum())
-    counts = counts_of(trials, gp.likelihood.categories)
-    return counts if 4 * counts.people * counts.x.shape[0] ** 3 < answers**3 else None
-
-
 def _shared_function(
     gp: OrdinalGP, trials: Trials, share: Float[Array, ""], inference: str, largest: int
 ) -> Posterior | None:
     """The shared function's posterior from all answers at once; None if they are too many."""
-    posterior = _from_counts(gp, _counts_if_cheaper(gp, trials, inference), share, largest)
-    if posterior is not None:
-        return posterior
-    if inference == "exact" or int(np.asarray(trials.mask).sum()) > largest:
+    mask = np.asarray(trials.mask)
+    if inference == "laplace" and few_points(trials):
+        people, points = int(mask.any(axis=1).sum()), len(np.unique(np.asarray(trials.x)[mask], axis=0))
+        if people * points**3 > largest**3:
+            return None
+        answers = tallied(trials, gp.likelihood.categories)
+        model = PeopleModel.of(gp, share, len(mask))
+        return shared_function(model, answers, answers.blank, every_point(model.unit, answers)).function
+    if inference == "exact" or mask.sum() > largest:
         return None
     return shared_posterior(fit_people(gp, of_people(trials), share, inference=inference, throw=False))
 
 
 def _pooled(gp: OrdinalGP, trials: Trials, inference: str, largest: int) -> Posterior | None:
     """One GP on everybody's answers, as if from one person; None if they are too many."""
-    counts = _counts_if_cheaper(gp, trials, inference)
-    one = to_device(1.0, gp.kernel.variance.dtype)
-    posterior = _from_counts(gp, None if counts is None else one_person(counts), one, largest)
     mask = np.asarray(trials.mask)
-    if posterior is not None or mask.sum() > largest:
-        return posterior
     everybody = Trials.from_arrays(np.asarray(trials.x)[mask], np.asarray(trials.q)[mask])
-    return fit(gp, everybody, inference=inference, throw=False)
-
-
-def _from_counts(gp: OrdinalGP, counts: Counts | None, share: Float[Array, ""], largest: int) -> Posterior | None:
-    """The shared function's posterior from counts; None if there are none, too many points, or the fit failed."""
-    if counts is None or counts.people * counts.x.shape[0] ** 3 > largest**3:
-        return None
-    posterior = fit_counts(gp, share, counts if float(share) < 1 else one_person(counts))
-    return posterior if bool(posterior.certificate.converged) else None
+    if inference != "laplace":
+        return None if mask.sum() > largest else fit(gp, everybody, inference=inference, throw=False)
+    answers = tallied(jax.tree.map(lambda leaf: leaf[None], everybody), gp.likelihood.categories)
+    return None if answers.x.shape[1] > largest else fit_counts(gp, answers.x[0], answers.counts[0])

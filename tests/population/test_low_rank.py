@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
-from hilbo.population.shared.counts import counts_of, fit_counts
-from hilbo.population.shared.features import pivots_for, pivots_of, unexplained
-from hilbo.population.shared.hierarchical import fit_people, of_people, shared_posterior
+from hilbo.kernels import gram
+from hilbo.laplace import laplace
+from hilbo.population.shared.features import every_point, pivots_for, pivots_of, unexplained
+from hilbo.population.shared.hierarchical import PersonKernel, fit_people, of_people, shared_posterior
 from hilbo.population.shared.low_rank import shared_evidence
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.posterior import shared_function
-from hilbo.population.shared.tallies import Tallies, tallied
+from hilbo.population.shared.tallies import CountTerms, Tallies, tallied
 
 EXACT = 1e-15  # what features may leave where nothing is to be left
 PEOPLE, ANSWERS = 3, 8
@@ -77,13 +78,27 @@ def test_is_the_dense_model():
     trials, people = stacked(), model()
     dense = fit_people(people.gp, of_people(trials), people.share)
     answers = apart(trials)
-    posterior = shared_function(people, answers, answers.blank, pivots_of(people.unit, answers, 24, EXACT)).function
+    posterior = shared_function(people, answers, answers.blank, every_point(people.unit, answers)).function
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 2)))
     np.testing.assert_allclose(evidence(people, answers).value, dense.log_evidence, rtol=1e-10)
     np.testing.assert_allclose(posterior.log_evidence, dense.log_evidence, rtol=1e-10)
     for by_features, by_all in zip(posterior.predict(x), shared_posterior(dense).predict(x), strict=True):
-        np.testing.assert_allclose(by_features, by_all, atol=1e-7)  # the square root of what features leave
+        np.testing.assert_allclose(by_features, by_all, atol=1e-11)
     assert bool(posterior.certificate.converged)
+
+
+def test_points_that_lie_close_together_lose_no_digits():
+    """Points that the features cannot tell apart: what was answered there is not carried over to others."""
+    trials = stacked()
+    close = eqx.tree_at(lambda t: t.x, trials, jnp.asarray(0.3 + 0.1 * np.asarray(trials.x)))
+    people, answers = model(), apart(close)
+    dense = shared_posterior(fit_people(people.gp, of_people(close), people.share))
+    pivots = every_point(people.unit, answers)
+    assert int(pivots.used.sum()) < int(pivots.carry.sum()) == int(close.mask.sum())
+    posterior = shared_function(people, answers, answers.blank, pivots).function
+    x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 2)))
+    for by_features, by_all in zip(posterior.predict(x), dense.predict(x), strict=True):
+        np.testing.assert_allclose(by_features, by_all, atol=1e-11)
 
 
 def test_one_person_is_an_ordinal_gp_whatever_the_features():
@@ -176,7 +191,38 @@ def test_hundreds_of_contradictory_answers_are_no_obstacle():
     x = np.repeat(rng.uniform(size=(5, 2)), 300, axis=0)
     each = [Trials.from_arrays(x, rng.integers(0, 3, len(x))) for _ in range(PEOPLE)]
     trials, people = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *each), model()
-    end = evidence(people, together(trials))
-    exact = fit_counts(people.gp, people.share, counts_of(trials, 3))
+    answers = together(trials)
+    end = evidence(people, answers)
+    number = jnp.broadcast_to(jnp.arange(PEOPLE, dtype=float)[:, None, None], (*answers.blank.shape, 1))
+    points = jnp.concatenate([answers.x, number], axis=2).reshape(-1, 3)
+    covariance = gram(PersonKernel(people.gp.kernel, people.share), points, points)
+    exact = laplace(covariance, CountTerms(people.gp.likelihood, answers.counts.reshape(-1, 3)))
     assert bool(end.arrived)
     np.testing.assert_allclose(end.value, exact.log_evidence, rtol=1e-10)
+
+
+# Of the dense evidence of `stacked()` at share 0.3, along theta (2), variance, thresholds (2), noise and the share.
+SLOPES = (0.23571106467, -0.15735659488, -0.6432411632, 0.50073662721, -1.25667631537, 5.61685992177, 0.89133164075)
+
+
+def slopes(log_evidence):
+    gp = OrdinalGP(RBF(jnp.array([4.0, 2.0]), 1.5), OrdinalProbit((-0.5, 0.5), 0.5))
+    slope = jax.jit(jax.grad(log_evidence, argnums=(0, 1)))(gp, jnp.asarray(0.3))
+    return jax.flatten_util.ravel_pytree(slope)[0]
+
+
+def test_the_evidence_has_the_derivatives_of_the_dense_one():
+    answers = apart(stacked())
+    pivots = every_point(RBF(jnp.array([4.0, 2.0])), answers)
+
+    def log_evidence(gp, share):
+        return shared_evidence(PeopleModel.of(gp, share, PEOPLE), answers, answers.blank, pivots).value
+
+    np.testing.assert_allclose(slopes(log_evidence), SLOPES, rtol=1e-8)
+
+
+@pytest.mark.deep  # what the default test compares with
+def test_the_derivatives_of_the_dense_evidence_are_those_that_stand_here():
+    everybody = of_people(stacked())
+    dense = slopes(lambda gp, share: fit_people(gp, everybody, share, throw=False).log_evidence)
+    np.testing.assert_allclose(dense, SLOPES, rtol=1e-9)

@@ -10,7 +10,7 @@ from hilbo.errors import InputError
 from hilbo.population.maps import even_rows, rule_map, share_of
 from hilbo.population.pointwise import aggregate
 from hilbo.population.rules.registry import POINTWISE
-from hilbo.population.shared.hierarchical import fit_people, of_people, predict_shared
+from hilbo.population.shared.hierarchical import fit_people, of_people, shared_posterior
 
 GP = OrdinalGP(RBF(4.0, 1.3), OrdinalProbit((-0.5, 0.5), 0.5))
 X = jnp.asarray(np.random.default_rng(9).uniform(size=(6, 2)))
@@ -38,7 +38,7 @@ def test_few_answers_are_merged_exactly_and_many_by_points():
     share = jnp.asarray(0.6)
     exact = rule_map(GP, trials, "hierarchical", share=share)
     dense = fit_people(GP, of_people(trials), 0.6)
-    for a, b in zip(exact.predict(X), predict_shared(dense, X), strict=True):
+    for a, b in zip(exact.predict(X), shared_posterior(dense).predict(X), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
     np.testing.assert_allclose(exact.newcomer(X)[1] - exact.predict(X)[1], 0.4 * 1.3, rtol=1e-12)
     points = rule_map(GP, trials, "hierarchical", share=share, largest=5)
@@ -59,6 +59,8 @@ def test_what_a_rule_cannot_do_is_refused():
         share_of(GP, cohort(people=1))
     with pytest.raises(InputError, match='the rule is "median"'):
         rule_map(GP, cohort(), "median")
+    with pytest.raises(InputError, match="nobody gave an answer"):
+        rule_map(GP, jax.vmap(Trials)(*jax.tree.map(jnp.zeros_like, (*jax.tree.leaves(cohort()),))), "pooled")
 
 
 def test_an_even_choice_of_people():

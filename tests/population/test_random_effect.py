@@ -10,13 +10,14 @@ from hilbo import OrdinalGP, Trials, fit
 from hilbo.population.judged.leave_one_out import _newcomer
 from hilbo.population.maps import RuleMap
 from hilbo.population.shared.features import pivots_of
-from hilbo.population.shared.hierarchical import NEWCOMER, PersonKernel
+from hilbo.population.shared.hierarchical import PersonKernel
 from hilbo.population.shared.low_rank import shared_evidence
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.posterior import shared_function
 from hilbo.population.shared.tallies import Tallies, tallied
 
 EXACT, PEOPLE, ANSWERS, CONTEXTS, RANK = 1e-15, 3, 8, 3, 24
+NOBODY = -1.0  # the number of a person who gave no answers
 NOWHERE = -1.0  # a context that nobody was asked in
 
 
@@ -77,7 +78,7 @@ def places():
 
 def at(x, context):
     """Points of a person nobody has met."""
-    columns = np.full(len(x), NEWCOMER), np.broadcast_to(np.asarray(context, float), len(x))
+    columns = np.full(len(x), NOBODY), np.broadcast_to(np.asarray(context, float), len(x))
     return jnp.asarray(np.concatenate([x, np.stack(columns, axis=1)], axis=1))
 
 

@@ -13,17 +13,27 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.kernels import Stationary, gram
 from hilbo.numerics.tracing import program
 from hilbo.population.shared.tallies import Tallies
 
-__all__ = ["TOLERANCE", "Pivots", "features_of", "pivots_for", "pivots_of", "root_of_pivots", "unexplained"]
+__all__ = [
+    "TOLERANCE",
+    "Pivots",
+    "every_point",
+    "features_of",
+    "pivots_for",
+    "pivots_of",
+    "root_of_pivots",
+    "unexplained",
+]
 
 TOLERANCE = 1e-6
 """Largest part of the prior variance of g that the features may leave at an answered point."""
 _ROOMS = (64, 256, 1024)  # of the programs that choose pivots
+_BLOCK, _DISTINCT = 64, 64  # of the sizes of records of all points; eps times it is left of a point that adds nothing
 _RANKS = (32, 64, 128, 256, 640, 1024)  # 640: all points of 24 people with 25 answers
 
 
@@ -32,6 +42,8 @@ class Pivots(NamedTuple):
 
     points: Float[Array, "r d"]
     used: Bool[Array, " r"]
+    carry: Bool[Array, " r"]
+    """Those that hold the weights of the answers that were given there: the used ones, and of `every_point` all."""
     left: Float[Array, ""]
     """Largest part of the prior variance of g, at an answered point, that they do not explain."""
 
@@ -42,7 +54,20 @@ def pivots_of(
     """Of the points that people were asked at, each where the ones before explain least; no more than there is `room`
     for, and than `most`."""
     x = answers.x.reshape(-1, answers.x.shape[-1])
-    start = answers.asked.reshape(-1).astype(x.dtype)
+    rows, left = _chosen(kernel, x, answers.asked.reshape(-1), room, tolerance, most)
+    used = rows >= 0
+    return Pivots(x[jnp.where(used, rows, 0)], used, used, left)
+
+
+def _chosen(
+    kernel: Stationary,
+    x: Float[Array, "N d"],
+    asked: Bool[Array, " N"],
+    room: int,
+    tolerance: ArrayLike,
+    most: ArrayLike | None = None,
+) -> tuple[Int[Array, "{room}"], Float[Array, ""]]:
+    """Rows of the points that are chosen, -1 beyond them; and what they leave."""
     largest = room if most is None else jnp.minimum(room, most)
 
     def going(state):
@@ -56,12 +81,13 @@ def pivots_of(
         row = (column - rows[:, place] @ rows) / jnp.sqrt(left[place])
         return count + 1, rows.at[count].set(row), (left - row**2).at[place].set(0.0), chosen.at[count].set(place)
 
-    initial = (jnp.asarray(0), jnp.zeros((room, x.shape[0]), x.dtype), start, jnp.zeros(room, int))
-    count, _, left, chosen = jax.lax.while_loop(going, choose, initial)
-    return Pivots(x[chosen], jnp.arange(room) < count, jnp.max(left))
+    initial = (jnp.asarray(0), jnp.zeros((room, x.shape[0]), x.dtype), asked.astype(x.dtype), jnp.full(room, -1))
+    _, _, left, chosen = jax.lax.while_loop(going, choose, initial)
+    return chosen, jnp.max(left)
 
 
 _pivots_of = program(pivots_of)
+_rows_of = program(_chosen)
 
 
 def pivots_for(
@@ -79,11 +105,26 @@ def pivots_for(
     return _with_room(pivots, rank)
 
 
+def every_point(kernel: Stationary, answers: Tallies) -> Pivots:
+    """All answered points, each once: with these the model is exact. As pivots are used what this precision can tell
+    from the ones before; the others follow, because the posterior's mean takes their answers where they were given.
+
+    The record's size is a multiple of 64, so that nearly as many points have the same programs.
+    """
+    points = np.unique(np.asarray(answers.x)[np.asarray(answers.asked)], axis=0)
+    count, room = len(points), _BLOCK * -(-len(points) // _BLOCK)
+    x, carry = jnp.asarray(np.pad(points, ((0, room - count), (0, 0)))), np.arange(room) < count
+    rows, left = _rows_of(kernel, x, jnp.asarray(carry), room, _DISTINCT * jnp.finfo(x.dtype).eps)
+    used = np.asarray(rows)[np.asarray(rows) >= 0]
+    order = np.concatenate([used, np.setdiff1d(np.arange(room), used)])
+    return Pivots(x[order], jnp.arange(room) < len(used), jnp.asarray(carry[order]), left)
+
+
 def _with_room(pivots: Pivots, rank: int) -> Pivots:
     """With this much room, of which the used ones take less."""
     more = max(rank - len(pivots.used), 0)
     points, used = np.pad(pivots.points[:rank], ((0, more), (0, 0))), np.pad(pivots.used[:rank], (0, more))
-    return Pivots(jnp.asarray(points), jnp.asarray(used), pivots.left)
+    return Pivots(jnp.asarray(points), jnp.asarray(used), jnp.asarray(used), pivots.left)
 
 
 @program

@@ -1,22 +1,21 @@
-"""The hierarchical model: people share a function and differ by functions of their own.
+"""The share of the prior variance that people have in common, and the model in which everybody has a number.
 
     f_j = g + h_j,   cov(g) = p k,   cov(h_j) = (1 - p) k,   so   cov(f_i(x), f_j(y)) = k(x, y) (p + (1 - p) [i = j])
 
 p, the share that people have in common, is learnt by evidence: p = 1 says that all people are one (the pooled model,
-and the committee machine's assumption), p = 0 that nothing is learnt about one person from another. The model is an
-ordinal GP like any other, with the person's number as one more coordinate of each point, so that fit, evidence and
-certificate are those of `ordinal_gp`. A person nobody has met has covariance p k with everybody: what is predicted at
-a number of its own is the prediction for a new person; the variance of g is (1 - p) k less.
+and the committee machine's assumption), p = 0 that nothing is learnt about one person from another.
 
-The pooled fit costs the cube of the number of answers. At the committee's cost, point by point from everybody's own
-posterior, stands `pointwise.aggregate("hierarchical", ...)`, with the p learnt here.
+The model is an ordinal GP like any other, with the person's number as one more coordinate of each point, so that fit,
+evidence and certificate are those of `ordinal_gp`, at a cost that is cubic in the number of answers. Where they are at
+few points, Laplace's evidence and posterior of g are those of `low_rank` with all points as pivots, which is the same
+at a cost that is linear in people; elsewhere it would be several times as slow.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
@@ -27,21 +26,24 @@ from hilbo.kernels import Kernel
 from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
+from hilbo.population.shared.features import Pivots, every_point
+from hilbo.population.shared.low_rank import SharedEvidence, shared_evidence
+from hilbo.population.shared.people_model import PeopleModel
+from hilbo.population.shared.tallies import Tallies, tallied
 
 __all__ = [
-    "NEWCOMER",
     "PersonKernel",
     "Share",
+    "few_points",
     "fit_people",
     "learn_share",
     "of_people",
-    "predict_shared",
     "share_from",
     "shared_posterior",
 ]
 
-NEWCOMER = -1.0
-"""The number of a person who has given no answers."""
+Evidence = Callable[[Float[Array, ""]], tuple[Any, Any]]
+"""Of a share: the log evidence there, and whether its fit held."""
 
 _NODES = 33  # of the log evidence's Chebyshev interpolation in p
 _ENOUGH, _USABLE = 1e-5, 0.02  # error of the log evidence between them: that ends the refinement, that is too large
@@ -110,21 +112,20 @@ def of_people(trials: Trials) -> Trials:
     )
 
 
+def few_points(trials: Trials) -> bool:
+    """Whether stacked trials (M, n) hold three times as many answers as points, or more: then the features of all
+    points (`low_rank`) cost less than a fit of all answers at once."""
+    mask = np.asarray(trials.mask)
+    return bool(3 * len(np.unique(np.asarray(trials.x)[mask], axis=0)) <= mask.sum())
+
+
 def fit_people(
     gp: OrdinalGP, trials: Trials, share: ArrayLike, *, inference: str = "laplace", throw: bool = True
 ) -> Posterior:
-    """Posterior of everybody's functions, from `of_people(...)`. Predict at points (x, person): an index from 0, or
-    `NEWCOMER`. Differentiable in `share`."""
+    """Posterior of everybody's functions, from `of_people(...)`. Predict at points (x, person): a number from 0, or
+    another for a person who gave no answers. Differentiable in `share`."""
     model = OrdinalGP(PersonKernel(gp.kernel, share), gp.likelihood)
     return fit(model, trials, inference=inference, throw=throw)
-
-
-def predict_shared(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Mean and variance (m,) of the shared function g, from a posterior of `fit_people`."""
-    points = jnp.concatenate([x, jnp.full((x.shape[0], 1), NEWCOMER, x.dtype)], axis=1)
-    mean, explained = posterior.predict_explained(points)
-    kernel = posterior.gp.kernel
-    return mean, kernel.share.astype(x.dtype) * jax.vmap(kernel.diagonal)(points) - explained
 
 
 def shared_posterior(posterior: Posterior) -> Posterior:
@@ -140,12 +141,49 @@ def shared_posterior(posterior: Posterior) -> Posterior:
     )
 
 
-def learn_share(gp: OrdinalGP, trials: Trials, *, inference: str = "laplace") -> Share:
-    """The posterior of the share p, from `of_people(...)`; `gp` is one person's model."""
-    return share_from(lambda share: _evidence(gp, trials, share, inference), trials.x.dtype)
+def learn_share(gp: OrdinalGP, trials: Trials, inference: str = "laplace") -> Share:
+    """The posterior of the share p from stacked trials (M, n); `gp` is one person's model."""
+    if inference == "laplace" and few_points(trials):
+        answers = tallied(trials, gp.likelihood.categories)
+        return share_from(_by_features(gp, answers), trials.x.dtype)
+    together = of_people(trials)
+    return share_from(lambda share: _by_numbers(gp, together, share, inference), trials.x.dtype)
 
 
-def share_from(evidence: Callable[[Float[Array, ""]], tuple[Any, Any]], dtype: DTypeLike) -> Share:
+def _by_features(gp: OrdinalGP, answers: Tallies) -> Evidence:
+    """By `low_rank`. The mode is sought from where those at the three nearest shares point to."""
+    pivots = every_point(PeopleModel.of(gp, 1.0, 0).unit, answers)
+    known: dict[float, Float[np.ndarray, "M n"]] = {}
+
+    def evidence(share: Float[Array, ""]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+        p = float(share)
+        near = sorted(known, key=lambda other: abs(other - p))[:3]
+        parts = {s: math.prod((p - other) / (s - other) for other in near if other != s) for s in near}
+        start = sum((part * known[s] for s, part in parts.items()), answers.blank)
+        end = _shared_evidence(gp, answers, share, to_device(start), pivots)
+        known[p] = np.asarray(end.weights)
+        return end.value, end.arrived
+
+    return evidence
+
+
+@program
+def _shared_evidence(
+    gp: OrdinalGP, answers: Tallies, share: Float[Array, ""], start: Float[Array, "M n"], pivots: Pivots
+) -> SharedEvidence:
+    return shared_evidence(PeopleModel.of(gp, share, len(start)), answers, start, pivots)
+
+
+@program
+def _by_numbers(
+    gp: OrdinalGP, trials: Trials, share: Float[Array, ""], inference: str
+) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """Log evidence at one share, from `of_people(...)`, and whether the fit held its certificate."""
+    posterior = fit_people(gp, trials, share, inference=inference, throw=False)
+    return posterior.log_evidence, posterior.certificate.converged
+
+
+def share_from(evidence: Evidence, dtype: DTypeLike) -> Share:
     """The posterior of the share from its log evidence: a function of a share to its value and whether the fit held.
 
     The evidence is computed at Chebyshev points of [0, 1], 9, 17 or 33 of them, and interpolated: it is smooth in p,
@@ -180,12 +218,3 @@ def share_from(evidence: Callable[[Float[Array, ""]], tuple[Any, Any]], dtype: D
 
 def _nodes() -> np.ndarray:
     return -np.cos(np.pi * np.arange(_NODES) / (_NODES - 1))
-
-
-@program
-def _evidence(
-    gp: OrdinalGP, trials: Trials, share: Float[Array, ""], inference: str
-) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Log evidence at one share, and whether the fit held its certificate."""
-    posterior = fit_people(gp, trials, share, inference=inference, throw=False)
-    return posterior.log_evidence, posterior.certificate.converged

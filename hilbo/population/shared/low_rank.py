@@ -15,7 +15,7 @@ and with W the curvatures, L_j L_j' = I + W_j^(1/2) K_j W_j^(1/2), A_j = L_j^-1 
 every system is solved by blocks of one person's answers and one of r x r: M n^3 + M n^2 r + M n r^2 + r^3 in place of
 (M n)^3. S is the posterior precision of the weights of g, g(x) = shared^(1/2) phi(x)'w.
 
-Laplace's method by Newton's steps, halved where the log posterior would fall. The evidence has exact first derivatives,
+Laplace's method by Newton's steps (`hilbo.newton_steps`). The evidence has exact first derivatives,
 by the implicit function theorem at the mode. References: Rasmussen & Williams (2006), sections 3.4 and 5.5.1;
 Snelson & Ghahramani (2007), AISTATS, for what is kept within a block; Harbrecht, Peters & Schneider (2012), Applied
 Numerical Mathematics 62:428, for the factorisation.
@@ -24,11 +24,13 @@ Numerical Mathematics 62:428, for the factorisation.
 from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from hilbo.gaussian import distance, residual_tolerance
 from hilbo.kernels import gram
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.population.shared.features import Pivots, features_of
@@ -36,18 +38,20 @@ from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.tallies import Expansion, Tallies, expand_counts
 
 __all__ = [
+    "AtWeights",
     "LowRankPrior",
     "Mode",
     "SharedEvidence",
     "System",
     "evidence_at",
     "mode_of",
+    "newton_step",
     "prior_of",
     "shared_evidence",
     "system_at",
 ]
 
-_STEPS, _HALVINGS = 60, 40
+_STEPS = 100
 
 
 # --- the prior, and what answers make of it
@@ -128,92 +132,59 @@ def _expand(model: PeopleModel, answers: Tallies, eta: Float[Array, "M n"]) -> E
 
 class Mode(NamedTuple):
     weights: Float[Array, "M n"]
-    further: Float[Array, "M n"]
-    """Where one more of Newton's steps ends."""
     residual: Float[Array, ""]
     tolerance: Float[Array, ""]
     steps: Int[Array, ""]
 
 
-def _newton_step(
-    prior: LowRankPrior, system: System, slope: Float[Array, "M n"], weights: Float[Array, "M n"]
-) -> Float[Array, "M n"]:
-    """a + r - (K + W^-1)^-1 K r, r = slope - a: an error of the step is one of r's size. `system` and `slope`, of the
-    log-likelihood, are those at the weights."""
-    off = slope - weights
-    return weights + off - system.solve(prior.times(off))
+class _OfWeights(eqx.Module):
+    """The log posterior as a function of the weights a, with which the latent values are K a."""
+
+    model: PeopleModel
+    answers: Tallies
+    prior: LowRankPrior
+
+    def at(self, weights: Float[Array, "M n"]) -> tuple[PyTree, Expansion]:
+        """The height there, its residual that of `laplace`; and the log-likelihood."""
+        from hilbo.newton_steps import Height  # imports optimistix, which is slow
+
+        prior = self.prior
+        eta = prior.times(weights)
+        terms = _expand(self.model, self.answers, eta)
+        # Latent values are sums whose terms may cancel: their rounding errors do not.
+        epsilon, absolute = jnp.finfo(weights.dtype).eps, jax.tree.map(jnp.abs, prior).times(jnp.abs(weights))
+        off = terms.slope - weights
+        summed = terms.slopes + terms.curvature * absolute + jnp.abs(weights)
+        size = jnp.sum(jnp.abs(terms.value)) + jnp.sum((0.5 * jnp.abs(weights) + terms.slopes) * absolute)
+        height = Height(
+            objective=jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta),
+            rounding=4.0 * epsilon * size,
+            residual=distance(off, prior.times(off)),
+            tolerance=residual_tolerance(distance(summed, prior.times(summed))),
+        )
+        return height, terms
+
+    def towards(self, weights: Float[Array, "M n"], terms: Expansion) -> tuple[Float[Array, "M n"], Float[Array, ""]]:
+        """By the system there."""
+        return newton_step(self.prior, system_at(self.prior, terms.curvature), terms.slope - weights)
 
 
-class _Height(NamedTuple):
-    """The log posterior at some weights, the size of its terms, and how far off the weights are."""
-
-    value: Float[Array, ""]
-    size: Float[Array, ""]
-    residual: Float[Array, ""]
-    tolerance: Float[Array, ""]
-
-
-class _Search(NamedTuple):
-    """The highest weights so far, and what is tried next: a part of the way to where Newton's step ends."""
-
-    weights: Float[Array, "M n"]
-    height: _Height
-    steps: Int[Array, ""]
-    full: Float[Array, "M n"]  # where Newton's step ends
-    part: Float[Array, ""]  # of the way there
-
-
-def _height(
-    prior: LowRankPrior, sizes: LowRankPrior, terms: Expansion, eta: Float[Array, "M n"], weights: Float[Array, "M n"]
-) -> _Height:
-    """`sizes`: of the numbers of the prior, because latent values are sums whose terms may cancel."""
-    epsilon = jnp.finfo(weights.dtype).eps
-    absolute = sizes.times(jnp.abs(weights))
-    value = jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta)
-    size = jnp.sum(jnp.abs(terms.value)) + 0.5 * jnp.sum(jnp.abs(weights) * absolute)
-    off = terms.slope - weights
-    summed = terms.slopes + terms.curvature * absolute + jnp.abs(weights)
-    residual, rounding = (
-        jnp.sqrt(jnp.linalg.norm(vector) * jnp.linalg.norm(prior.times(vector))) for vector in (off, summed)
-    )
-    tolerance = jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
-    return _Height(value, size, residual, tolerance)
+def newton_step(
+    prior: LowRankPrior, system: System, off: Float[Array, "M n"]
+) -> tuple[Float[Array, "M n"], Float[Array, ""]]:
+    """r - (K + W^-1)^-1 K r, r = slope - a: an error of the step is one of r's size; and the rate of ascent along
+    it."""
+    moved = prior.times(off)
+    step = off - system.solve(moved)
+    return step, jnp.sum(moved * step)
 
 
 def mode_of(model: PeopleModel, answers: Tallies, prior: LowRankPrior, start: Float[Array, "M n"]) -> Mode:
-    """Newton's steps on the weights, from `start`, each halved until the log posterior does not fall; the residual is
-    that of `laplace`. The likelihood is expanded at one place of the program, because each place takes time to compile:
-    the start is evaluated as a first step, from a log posterior of minus infinity."""
-    epsilon, sizes = jnp.finfo(start.dtype).eps, jax.tree.map(jnp.abs, prior)
+    """Damped Newton steps on the weights, from `start`."""
+    from hilbo.newton_steps import climbed  # imports optimistix, which is slow
 
-    def going(search):
-        here = search.height
-        return (here.residual > here.tolerance) & (search.steps < _STEPS) & (search.part > 0.5 ** (_HALVINGS + 1))
-
-    def forward(search):
-        weights, here, steps, full, part = search
-        trial = jnp.where(part == 1.0, full, weights + part * (full - weights))
-        eta = prior.times(trial)
-        terms = _expand(model, answers, eta)
-        reached = _height(prior, sizes, terms, eta, trial)
-        not_below = reached.value >= here.value - 8.0 * epsilon * here.size
-        weights, here, part, steps = jax.tree.map(
-            lambda new, old: jnp.where(not_below, new, old),
-            (trial, reached, jnp.ones_like(part), steps + 1),
-            (weights, here, 0.5 * part, steps),
-        )
-        full = jax.lax.cond(
-            not_below,
-            lambda: _newton_step(prior, system_at(prior, terms.curvature), terms.slope, trial),
-            lambda: full,
-        )
-        return _Search(weights, here, steps, full, part)
-
-    infinite = jnp.full_like(start[0, 0], jnp.inf)
-    nowhere = _Height(-infinite, jnp.zeros_like(infinite), infinite, jnp.zeros_like(infinite))
-    begin = _Search(start, nowhere, jnp.asarray(-1), start, jnp.ones_like(infinite))
-    end = jax.lax.while_loop(going, forward, begin)
-    return Mode(end.weights, end.full, end.height.residual, end.height.tolerance, end.steps)
+    weights, height, steps = climbed(_OfWeights(model, answers, prior), start, _STEPS)
+    return Mode(weights, height.residual, height.tolerance, steps)
 
 
 class SharedEvidence(NamedTuple):
@@ -234,19 +205,26 @@ def shared_evidence(model: PeopleModel, answers: Tallies, start: Float[Array, "M
     still = jax.lax.stop_gradient
     prior = prior_of(model, answers, still(pivots))
     mode = still(mode_of(still(model), answers, still(prior), start))
-    value = _evidence_at_mode(model, answers, prior, mode.further)
+    value = _evidence_at_mode(model, answers, prior, mode.weights)
     arrived = (mode.residual <= mode.tolerance) & jnp.isfinite(value)
     return SharedEvidence(value, mode.weights, arrived)
 
 
-def evidence_at(
-    model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]
-) -> tuple[Float[Array, ""], System]:
-    """The log evidence at some weights, and the system there."""
+class AtWeights(NamedTuple):
+    """The log evidence at some weights; the slopes of the log-likelihood and the system there."""
+
+    log_evidence: Float[Array, ""]
+    slope: Float[Array, "M n"]
+    system: System
+
+
+def evidence_at(model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]) -> AtWeights:
+    """Laplace's approximation, as if the weights were the mode's."""
     eta = prior.times(weights)
     terms = _expand(model, answers, eta)
     system = system_at(prior, terms.curvature)
-    return jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta) - 0.5 * system.log_determinant, system
+    value = jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta) - 0.5 * system.log_determinant
+    return AtWeights(value, terms.slope, system)
 
 
 @jax.custom_vjp
@@ -254,12 +232,16 @@ def _evidence_at_mode(
     model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]
 ) -> Float[Array, ""]:
     """`evidence_at` at the mode's weights, which follow model and prior. Differentiable once, in these two."""
-    return evidence_at(model, answers, prior, weights)[0]
+    return evidence_at(model, answers, prior, weights).log_evidence
 
 
 def _evidence_forward(model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]):
-    value, pull, system = jax.vjp(lambda *at: evidence_at(at[0], answers, *at[1:]), model, prior, weights, has_aux=True)
-    return value, (pull, system, model, answers, prior, weights)
+    def value(*at):
+        end = evidence_at(at[0], answers, *at[1:])
+        return end.log_evidence, end.system
+
+    log_evidence, pull, system = jax.vjp(value, model, prior, weights, has_aux=True)
+    return log_evidence, (pull, system, model, answers, prior, weights)
 
 
 def _evidence_backward(kept, slope: Float[Array, ""]):

@@ -3,6 +3,7 @@ person's own, of one kernel; in context c, such as a clip, f_j + u_c."""
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from hilbo.kernels import RBF, Stationary
@@ -15,8 +16,8 @@ __all__ = ["PeopleModel"]
 class PeopleModel(eqx.Module):
     """The hyperparameters of the hierarchical model of M people."""
 
-    theta: Float[Array, " d"]
-    """Inverse squared lengths, per squared unit of x."""
+    theta: Float[Array, "*d"]
+    """Inverse squared lengths, per squared unit of x; one, or one for each coordinate."""
     shared: Float[Array, ""]
     """Prior variance of g."""
     own: Float[Array, ""]
@@ -31,6 +32,15 @@ class PeopleModel(eqx.Module):
     """For each coordinate its number of unordered levels, as kernels take it."""
     effect: Float[Array, ""] | None = None
     """Prior variance of what each context adds to everybody's function; None without a random effect."""
+
+    @classmethod
+    def of(cls, gp: OrdinalGP, share: ArrayLike, people: int) -> "PeopleModel":
+        """One person's model `gp`, whose prior variance people have in common as far as `share`, in [0, 1], says."""
+        kernel, likelihood = gp.kernel, gp.likelihood
+        share, widths = jnp.asarray(share, kernel.variance.dtype), jnp.zeros(people, kernel.variance.dtype)
+        shared, own = share * kernel.variance, (1.0 - share) * kernel.variance
+        model = kernel.theta, shared, own, likelihood.thresholds, likelihood.noise, widths
+        return cls(*model, kernel=type(kernel), levels=kernel.levels)
 
     @property
     def share(self) -> Float[Array, ""]:

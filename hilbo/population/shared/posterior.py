@@ -15,7 +15,7 @@ from hilbo.numerics.linalg import eigh
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.shared.features import Pivots, root_of_pivots
-from hilbo.population.shared.low_rank import System, evidence_at, mode_of, prior_of
+from hilbo.population.shared.low_rank import System, evidence_at, mode_of, newton_step, prior_of
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.tallies import Tallies
 
@@ -56,19 +56,21 @@ def shared_function(model: PeopleModel, answers: Tallies, start: Float[Array, "M
     arguments as those of `shared_evidence`.
 
     What all answers say of g goes through its weights w, of precision S and mean F'a: with L L' = k(Z, Z) the mean is
-    k(x, Z) L^-T w and k(x, Z) L^-T (I - S^-1) L^-1 k(Z, x) of the prior variance is explained. Never raises: read
-    `certificate.converged`.
+    k(x, Z) L^-T w and k(x, Z) L^-T (I - S^-1) L^-1 k(Z, x) of the prior variance is explained. Answers that were given
+    at a pivot weigh there by themselves: L, which may be nearly singular, only carries over the others. Never raises:
+    read `certificate.converged`.
     """
     rank = len(pivots.points)
     prior = prior_of(model, answers, pivots)
     mode = mode_of(model, answers, prior, start)
-    value, system = evidence_at(model, answers, prior, mode.weights)
+    value, slope, system = evidence_at(model, answers, prior, mode.weights)
     # One step more changes the evidence by what is left of the way, or more.
-    error = jnp.abs(evidence_at(model, answers, prior, mode.further)[0] - value)
+    further = mode.weights + newton_step(prior, system, slope - mode.weights)[0]
+    error = jnp.abs(evidence_at(model, answers, prior, further).log_evidence - value)
 
     root = jnp.sqrt(model.shared) * root_of_pivots(model.unit, pivots)
     together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
-    weights = jnp.where(pivots.used, solve_triangular(root, together[:rank], lower=True, trans=1), 0.0)
+    weights = _weights_at(answers, mode.weights, prior.features[..., :rank], pivots, root)
     factor = jnp.where(pivots.used[None, :], _explained(_without_effect(system.precision, rank), root), 0.0)
 
     kernel = model.of_variance(model.shared)
@@ -91,9 +93,29 @@ def shared_function(model: PeopleModel, answers: Tallies, start: Float[Array, "M
         converged=(mode.residual <= mode.tolerance) & known_well,
     )
     latent = GaussianPosterior(covariance @ weights, weights, factor, factor.T @ factor, value, certificate)
-    asked = Trials(pivots.points, jnp.zeros(rank, jnp.int32), pivots.used)
+    asked = Trials(pivots.points, jnp.zeros(rank, jnp.int32), pivots.carry)
     function = Posterior(OrdinalGP(kernel, OrdinalProbit(model.thresholds, model.noise)), asked, latent)
     return SharedFunction(function, _effects_of(model, system, together, pivots.points, root))
+
+
+def _weights_at(
+    answers: Tallies,
+    weights: Float[Array, "M n"],
+    features: Float[Array, "M n r"],
+    pivots: Pivots,
+    root: Float[Array, "r r"],
+) -> Float[Array, " r"]:
+    """The weights of the pivots, from those of the answers."""
+
+    def of_person(total, person):
+        x, weights, features = person
+        same = jnp.all(x[:, None] == pivots.points[None], axis=2) & pivots.carry[None]
+        elsewhere = jnp.where(jnp.any(same, axis=1), 0.0, weights)
+        return jax.tree.map(jnp.add, total, (weights @ same.astype(weights.dtype), elsewhere @ features)), None
+
+    zero = jnp.zeros_like(root[0])
+    (there, carried), _ = jax.lax.scan(of_person, (zero, zero), (answers.x, weights, features))
+    return there + jnp.where(pivots.used, solve_triangular(root, carried, lower=True, trans=1), 0.0)
 
 
 def _effects_of(

@@ -1,5 +1,6 @@
 """Everybody's answers, the repeated ones added up: at one point only how often each category was chosen counts."""
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,10 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hilbo.kernels import gram
+from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.ordinal_gp import Trials
+from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 
-__all__ = ["Expansion", "Tallies", "expand_counts", "tallied"]
+__all__ = ["CountTerms", "Expansion", "Tallies", "expand_counts", "fit_counts", "tallied"]
 
 
 class Tallies(eqx.Module):
@@ -72,6 +76,25 @@ class Expansion(NamedTuple):
     """Minus the second derivative."""
     slopes: Float[Array, "..."]
     """The sum of the answers' absolute slopes, by which the slope's rounding error is judged."""
+
+
+class CountTerms(eqx.Module):
+    """Log-likelihood terms of `hilbo.laplace`, of so many answers in each category at each of n points."""
+
+    likelihood: OrdinalProbit
+    counts: Float[Array, "n C"]
+
+    def __call__(self, eta: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+        """Values, slopes and curvatures at the latent values."""
+        return jax.vmap(partial(expand_counts, self.likelihood))(eta, self.counts)[:3]
+
+
+@program
+def fit_counts(gp: OrdinalGP, x: Float[Array, "n d"], counts: Float[Array, "n C"]) -> Posterior:
+    """Laplace's posterior of one person, as `fit` has it, from how often each category was chosen at n points. Never
+    raises: read `certificate.converged`."""
+    latent = laplace(gram(gp.kernel, x, x), CountTerms(gp.likelihood, counts))
+    return Posterior(gp, Trials(x, jnp.zeros(len(x), jnp.int32), jnp.sum(counts, axis=1) > 0), latent)
 
 
 def expand_counts(likelihood: OrdinalProbit, f: Float[Array, ""], counts: Float[Array, " C"]) -> Expansion:
