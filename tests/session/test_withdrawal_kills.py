@@ -117,6 +117,15 @@ def test_nothing_is_both_removed_and_left(whole, tmp_path):
     assert set(done.left) == {str(tmp_path / "copy" / "warm.nc")}
 
 
+def test_what_killed_commands_left_goes_too(whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "copy")
+    (tmp_path / "copy" / "logs" / ".hilbo-0123.part").write_text("P02")
+    (tmp_path / "copy" / "logs" / ".map-01234567.part").mkdir()
+    (tmp_path / "copy" / "logs" / ".map-01234567.part" / "result.json").write_text("P02")
+    delete_participant(tmp_path / "copy", "P02")
+    assert faults(tmp_path / "copy", {"P02"}, {*PEOPLE} - {"P02"}) == []
+
+
 def test_results_that_are_being_made_are_waited_for_and_none_begin_meanwhile(whole, tmp_path, monkeypatch):
     monkeypatch.setattr("hilbo.study.disk.new_folder.locked_folder", functools.partial(locked_folder, patience=0.05))
     folder = tmp_path / "copy"
