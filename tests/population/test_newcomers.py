@@ -144,7 +144,8 @@ def test_what_a_map_does_not_know_is_hatched(prior, hatched):
     """A map whose variance is 0.09 everywhere knows nothing if that is 0.9 of its own prior's."""
     drawn = []
     axes = SimpleNamespace(contourf=lambda *args, **named: drawn.append(args))
-    map_slice = Slice(np.zeros((101, 101)), np.full((101, 101), 0.3))
+    sides = (np.linspace(0, 1, 101), np.linspace(0, 1, 101))
+    map_slice = Slice(np.zeros((101, 101)), np.full((101, 101), 0.3), sides)
     assert plotting_study._hatch(axes, STUDY, map_slice, prior) == bool(drawn) == hatched
 
 
