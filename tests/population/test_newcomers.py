@@ -146,7 +146,7 @@ def test_what_a_map_does_not_know_is_hatched(prior, hatched):
     axes = SimpleNamespace(contourf=lambda *args, **named: drawn.append(args))
     sides = (np.linspace(0, 1, 101), np.linspace(0, 1, 101))
     map_slice = Slice(np.zeros((101, 101)), np.full((101, 101), 0.3), sides)
-    assert plotting_study._hatch(axes, STUDY, map_slice, prior) == bool(drawn) == hatched
+    assert plotting_study._hatch(axes, map_slice, prior) == bool(drawn) == hatched
 
 
 # Widths of people's middle categories are integrated out.
