@@ -12,14 +12,15 @@ from hilbo.population.judged.leave_one_out import LeftOut, calibration
 from hilbo.population.rules.registry import GIVEN, RECOMMENDED
 from hilbo.population.shared.hierarchical import Share
 from hilbo.report.study.comparison import write_comparison
-from hilbo.study.analysis.rule_comparison import recommendation
+from hilbo.study.analysis.rule_comparison import compare, recommendation
 from hilbo.study.estimate.aggregate import aggregate_cohort
 
 
 @pytest.mark.deep
 def test_everything_is_compared_and_written(tmp_path):
     study = dataclasses.replace(plain_study(2), rule="average")
-    content = write_comparison(study, aggregate_cohort(study, answered(study, people=4)), tmp_path).content
+    aggregate = aggregate_cohort(study, answered(study, people=4))
+    content = write_comparison(study, aggregate, compare(study, aggregate), tmp_path).content
     assert json.loads((tmp_path / "comparison.json").read_text()) == content
     assert set(content["rules"]) == {*GIVEN, RECOMMENDED}
     assert content["rules"][RECOMMENDED]["hyperparameters"] == "learnt in each fold"
