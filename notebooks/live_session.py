@@ -19,8 +19,9 @@ from hilbo.app.rehearsal.rehearsal import Decider
 from hilbo.hardware_bridge import Renderer
 from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.log.actions import answer, go_on, present, propose, sent
-from hilbo.session.log.event_log import EventLog, log_name
+from hilbo.session.log.event_log import EventLog
 from hilbo.session.log.header import header_for
+from hilbo.session.log.log_files import log_name
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 
