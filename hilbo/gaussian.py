@@ -197,8 +197,9 @@ def evidence_tolerance(log_evidence: Scalar) -> Scalar:
 
 
 def distance(off: Float[Array, "..."], moved: Float[Array, "..."]) -> Scalar:
-    """A bound on sqrt(off' K off), from `off` and `moved`, K off: by how many of the prior's standard deviations
-    weights a with `off`, slope - a, are from the mode. It cannot be rounded to less than 0. Both of one shape."""
+    """Upper bound sqrt(|off| |K off|) of sqrt(off' K off), the distance of weights a from the mode in standard
+    deviations of the prior, where `off` is slope - a and `moved` is K off, of one shape. Rounding does not
+    make it negative."""
     return jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(moved))
 
 

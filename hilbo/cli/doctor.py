@@ -168,7 +168,7 @@ def _precision() -> Check:
 
 
 def _study(path: Path) -> Iterator[Check]:
-    """The checks that need the study's model."""
+    """Checks of the feasible set and of the compiled step; one failed check if the study cannot be loaded."""
     from hilbo.study.config import Study
 
     try:

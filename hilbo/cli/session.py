@@ -276,7 +276,8 @@ def _reissued(path, study_path, study, text, results_):
 
 
 def _check_not_in_map(path, study_path, materials, results_, new):
-    """Refuse somebody new who is in the map that is validated. The plan itself does not say who is."""
+    """Raise InputError if the participant `new` is one of the people of the aggregate that the plan validates. Only the
+    result files (`results_`) name them."""
     if not results_:
         raise InputError(
             f"{path}: validates an aggregate, by people who are not in it; add --from result.json, of which its sets"

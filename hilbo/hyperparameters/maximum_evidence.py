@@ -247,7 +247,7 @@ def optimum_sensitivity(
     walls: Polytope | None = None,
     held: Bool[Array, " d"] | None = None,
 ) -> Coordinates:
-    """Derivative of an optimum by the hyperparameters: d x / d(coordinate), (d, ...) in units of the search ranges.
+    """Derivative of an optimum x (unit cube) by each learnt hyperparameter: a record of arrays (d, ...).
 
     At a maximum the gradient along free directions is 0, so that by the implicit function theorem dw = -H^-1
     d(gradient) there; directions across an active wall stay fixed. Positive hyperparameters are on a log scale.

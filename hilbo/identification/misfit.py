@@ -36,7 +36,7 @@ def filter_score(fitted: Fit) -> float:
 
 @program
 def _filter_scores(fit: Fit, corners: Float[Array, " f"]) -> Float[Array, " f"]:
-    """Score statistic of each corner frequency (Hz); positive if the filter lowers the cost."""
+    """Score statistic of a low-pass force filter at each corner frequency (Hz); positive if it lowers the cost."""
     before = fitted_residuals(fit, fit.q)
     slopes = jax.jacfwd(lambda x: fitted_residuals(fit, x))(fit.q)
     models = noises(fit)

@@ -89,7 +89,7 @@ def gl_coefficients(alpha: Real[ArrayLike, ""], N: int) -> Float[Array, " {N+1}"
 
 @partial(jax.jit, static_argnames="N")
 def gl_sums(alpha: Real[ArrayLike, ""], N: int) -> GLSums:
-    """C(1), C(-1), their difference and the first moment for one order α and short memory. `alpha` is a scalar."""
+    """Sums of `GLSums` for one order α (a scalar) and a memory of N samples."""
     return _gl_sums_jet(jnp.asarray(alpha, jnp.result_type(1.0, alpha)), N, 0)[0]
 
 
@@ -129,7 +129,7 @@ def _longer(jet: Callable) -> Callable:
 
 
 def _gl_sums(alpha: Number, N: int) -> GLSums:
-    """The sums for short memory, accumulated in one loop over the taps."""
+    """`gl_sums` in NumPy or JAX, accumulated in one loop over the taps; no sum is a difference of large ones."""
     xp = namespace_of(alpha)
 
     def add(sums, i):

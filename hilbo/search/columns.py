@@ -65,7 +65,8 @@ class Columns:
         return w.at[..., K1].set(start + w[..., K1] * width)
 
     def to_shares(self, w: Float[Array, "*batch d"], x: Float[Array, "*batch d"]) -> Float[Array, "*batch d"]:
-        """Inverse of `from_shares`: K1 of the points `w` as a fraction of the columns of the same points `x`."""
+        """Inverse of `from_shares`: `w` with its K1 replaced by the share of the column, 0 to 1, at which K1 is. `x`:
+        the same points in the unit cube."""
         K1 = self.index("K1")
         if not self.between:
             return w.at[..., K1].divide(self.passive_end(x))

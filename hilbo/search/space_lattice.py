@@ -42,7 +42,9 @@ def _on_device(nodes, inside, ends, present, extra, along, dim) -> Lattice:
 
 
 def _steep_wall(space, levels):
-    """Points of the passivity boundary at every second of these x_K1, (p, 3), for a space of K1, B1 and alpha only."""
+    """Points (p, 3) of the unit cube where the upper end of K1 crosses every second one of `levels` (unit-cube K1),
+    sought along alpha and along B1: a grid of columns misses the boundary where it is steep. Only for spaces of K1, B1
+    and alpha."""
     high, rises = column_table(space.columns)[1], levels[-1:0:-2]
     points = np.ones((0, 3))
     for table, lines, positions, names in (

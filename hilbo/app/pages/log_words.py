@@ -49,6 +49,7 @@ def _because(data: Mapping[str, Any]) -> str:
 
 
 def _proposed(_state, name, data):
+    """Which trial (`name`) comes next, and why: a repetition, planned sets, or how it was chosen."""
     sets = " and ".join(data.get("sets", {}).values())
     if data["repeats"] is not None:
         return f"{name} comes next: a repetition, as a check of consistency."

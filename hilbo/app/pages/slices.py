@@ -111,7 +111,9 @@ class _Slices(NamedTuple):
 
 
 def _slice(study, maps: _Slices, k: int, pair: _Pair, marks, levels, felt) -> dict[str, Any]:
-    """One grid, for the page; `marks` (n, d) and `levels` (n,) are the answers, `felt` (d,) what is being felt."""
+    """Slice `k` of `maps` as JSON for the page: means (None where infeasible), the values of the other parameters, and
+    each answer with its distance from the slice. `pair`: indices of the parameters across and up; without an up, an
+    answer's height is its level. `marks` (n, d) and `levels` (n,): the answers; `felt` (d,): the present rendering."""
     best, names = maps.best, study.space.names
     others = [i for i in range(len(names)) if i not in pair]
     held = [_held(study.space.parameters[i], float(best[i])) for i in others]

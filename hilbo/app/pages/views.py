@@ -77,8 +77,9 @@ def participant(hub: HubInterface) -> View:
 
 
 def _words(hub: HubInterface, screen: str, stage: str, text: Text) -> tuple[str, str, str]:
-    """Title, message and phase while nothing is presented. How to let go of a program's stimulus is in the study's own
-    texts."""
+    """Title, message and phase ("hello", "wait" or the name of the screen) of a page while nothing is presented. The
+    text of a screen other than "trial" is split after its first sentence. How to let go of a program's
+    stimulus is in the study's own texts."""
     if screen == "trial":
         key = {"hello": "title", "between": "sent", "let-go": "let_go", "trouble": "trouble"}.get(stage, "wait")
         more = {"hello": "hello"} | ({"let-go": "lift"} if hub.state.study.stimulus is None else {})

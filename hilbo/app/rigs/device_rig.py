@@ -165,7 +165,8 @@ class DeviceRig:
         return True
 
     def _load(self, device: Renderer, wanted: ParameterSet) -> Loaded | None:
-        """The set in force; None while something touches the handle."""
+        """Send a set, and return the one in force afterwards with the time it took; None, and nothing sent, while
+        something touches the handle."""
         self._see(self._look())
         if self.snapshot.contact:
             return None

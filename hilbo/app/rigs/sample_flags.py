@@ -34,7 +34,7 @@ class SampleCounter:
             self._of, self._counts = of, {SAMPLES: 0}
 
     def drain(self) -> None:
-        """Count what has arrived."""
+        """Add the samples that arrived since the last call to the counts of the present trial."""
         with self._lock:
             self._add()
 

@@ -212,7 +212,11 @@ class StimulusRig:
         """None: a program sends no telemetry."""
 
     async def show(self, showing: Showing) -> Loaded | None:
-        """Order a step, for a program with force once nothing touches it, and wait for its confirmation."""
+        """Order a step and wait for its confirmation; a program that exerts force is ordered once nothing touches it.
+
+        None for a neutral step or one without values. Raises MissedError, and orders neutral, if no confirmation comes
+        in time.
+        """
         self._check_present()
         if showing.show == "neutral":
             await self.blank()

@@ -46,7 +46,7 @@ class Listener:
         self._clock.cancel()
         self._loop.remove_reader(self._listening)
         for line in list(self._pending):
-            self._close_line(line)
+            self._close_connection(line)
 
     def _accept(self) -> None:
         for _ in range(_AT_ONCE):
@@ -65,8 +65,9 @@ class Listener:
             self._make_room(self._most)
 
     def _make_room(self, most: int) -> None:
+        """Close the oldest pending connection if more than `most` are pending."""
         if len(self._pending) > most:
-            self._close_line(next(iter(self._pending)))
+            self._close_connection(next(iter(self._pending)))
 
     def _readable(self, line: socket.socket) -> None:
         self._unwatch(line)
@@ -82,7 +83,7 @@ class Listener:
             said = b""
         role = self._gate.role_in(said)
         if not said:
-            self._close_line(line)
+            self._close_connection(line)
         elif role == "experimenter":
             self._admit_line(line, role)
         else:
@@ -93,7 +94,7 @@ class Listener:
         self._forget(line)
         self._admit(line, role)
 
-    def _close_line(self, line: socket.socket) -> None:
+    def _close_connection(self, line: socket.socket) -> None:
         self._forget(line)
         self._unwatch(line)
         with contextlib.suppress(OSError):
@@ -111,5 +112,5 @@ class Listener:
     def _tick(self) -> None:
         now = self._loop.time()
         for line in [line for line, until in self._pending.items() if until < now]:
-            self._close_line(line)
+            self._close_connection(line)
         self._clock = self._loop.call_later(1.0, self._tick)

@@ -96,6 +96,7 @@ class _Terminal:
         _check_phrase(sys.stdin.readline().strip(), "The answer")
 
     def place(self, moved_mm: float) -> float:
+        """Ask the person to hold the handle at the surface: position 0 mm. `moved_mm` is not needed for that."""
         _ask("The motor is at rest. Place the handle at the surface, hold it there, and press Enter.")
         if not sys.stdin.readline():
             raise InputError("The handle was not placed at the surface (end of input); commission the device again.")

@@ -113,8 +113,8 @@ def of_people(trials: Trials) -> Trials:
 
 
 def few_points(trials: Trials) -> bool:
-    """Whether stacked trials (M, n) hold three times as many answers as points, or more: then the features of all
-    points (`low_rank`) cost less than a fit of all answers at once."""
+    """Whether stacked trials (M, n) hold at least three answers for each distinct point: the low-rank model with all
+    points as pivots then costs less than a fit of all answers at once."""
     mask = np.asarray(trials.mask)
     return bool(3 * len(np.unique(np.asarray(trials.x)[mask], axis=0)) <= mask.sum())
 

@@ -41,6 +41,7 @@ def _sent(state, event):
 
 
 def _stimulus(state, event):
+    """A step of the presentation begins or ends; a rendering counts as felt from then on, and step 0 starts anew."""
     trial, show = state.trial(event.data["id"]), event.data["show"]
     if not event.data["on"]:
         return state.with_trial(trial.id, on=None)

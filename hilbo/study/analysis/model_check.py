@@ -62,7 +62,7 @@ def model_check(study: Study, aggregate: Aggregate) -> Content | None:
 
 
 def check_sentences(content: Content | None) -> list[str]:
-    """What does not fit, in one sentence; none where nothing was found."""
+    """At most one sentence, with every misfit; [] if there is none, or nothing was checked (`content` None)."""
     if content is None:
         return []
     wrong = [

@@ -80,7 +80,7 @@ def tolerance_ends(
 def _predictions(
     posteriors: Posterior, x: Float[Array, "m d"]
 ) -> tuple[Float[Array, "M m"], Float[Array, "M m"], Float[Array, " m"]]:
-    """Everybody's means and explained variances at points, and the prior variance there."""
+    """Posterior mean and variance reduction (prior minus posterior) of each person, and prior variance, at points."""
     means, explained = jax.lax.map(lambda p: p.predict_explained(x), posteriors)
     kernel = jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel
     return means, explained, jax.vmap(kernel.diagonal)(x)
