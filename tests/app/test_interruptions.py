@@ -5,7 +5,7 @@ Whatever it is, nothing is lost, and what was being felt is felt again once some
 
 import json
 import os
-import time
+import threading
 import urllib.request
 
 import pytest
@@ -99,6 +99,23 @@ def test_a_sleeping_laptop_begins_the_trial_again(tmp_path, monkeypatch):
         live.until(lambda v: v["may"]["begin"])
         live.until(lambda _: live.events("repeat"))
         assert "slept" in live.events("note")[-1].data["text"]
+
+
+def test_a_slow_disk_is_no_laptop_that_slept(live, monkeypatch):
+    """While the disk's thread is busy the log cannot be checked; the clocks are watched all the same."""
+    interruptions, looked, done = live.hub._interruptions, [], threading.Event()
+    write = interruptions._write
+
+    async def counted():
+        looked.append(1)
+        await write()
+
+    monkeypatch.setattr(interruptions, "_write", counted)
+    live.hub._disk.submit(done.wait)
+    try:
+        live.until(lambda _: len(looked) > 20, lambda: len(looked))
+    finally:
+        done.set()
 
 
 def test_the_watch_goes_on_after_a_fault_and_says_so(live, monkeypatch):

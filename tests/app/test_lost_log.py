@@ -28,7 +28,7 @@ def test_the_session_stops_and_every_acknowledged_answer_is_in_the_copy(tmp_path
         view = live.question()
         fault(live.path)
         seen = live.until(lambda view: view["alert"], live.whole)
-        assert f"{live.path}: " in seen["alert"] and "2 answers acknowledged so far are in" in seen["alert"]
+        assert f"{live.path}: " in seen["alert"] and "Acknowledged so far: 2 answers, in" in seen["alert"]
         assert not {"note", "pause", "undo", "void", "abort"} & set(seen["may"]) and "estop" in seen["may"]
         with refused(503):
             live.answer(view)

@@ -10,7 +10,7 @@ from live import STUDY, Driver
 from hilbo.errors import InputError
 from hilbo.session.export.tables import read_sessions
 from hilbo.session.log import actions as live
-from hilbo.session.log.event_log import EventLog, LogLostError, read_log
+from hilbo.session.log.event_log import EventLog, LogError, LogLostError, read_log
 from hilbo.session.log.log_files import log_name, log_paths
 
 
@@ -88,7 +88,7 @@ def test_everything_acknowledged_is_in_the_copy_and_nothing_more_is_acknowledged
         assert before == driven.events[:at] and after == [] and log.state.seq == at
         (copy,) = copies(path.parent)
         answers = sum(trial.status == "answered" for trial in log.state.trials)
-        assert f"The {answers} answers acknowledged so far are in {copy}" in str(error)
+        assert f"Acknowledged so far: {answers} answer" in str(error) and f"in {copy}; end this server" in str(error)
         assert read_log(copy, STUDY.file)[1] == before and copy.stat().st_mode & 0o777 == 0o600
         with pytest.raises(LogLostError):
             log.check()
@@ -117,14 +117,33 @@ def test_a_copy_that_cannot_be_written_names_what_is_at_stake_and_is_tried_again
         done, _ = acknowledged(log, driven.events[:-1])
         folder_renamed(path)
         path.parent.write_text("in the way of the folder")
-        with pytest.raises(
-            LogLostError, match=r"answers acknowledged so far are at stake: .* make the folder writable"
-        ):
+        with pytest.raises(LogLostError, match=r"answers, which could not be copied .* make the folder writable"):
             log.append(driven.events[-1])
         path.parent.unlink()
-        with pytest.raises(LogLostError, match=r"acknowledged so far are in .*rescued\.jsonl"):
+        with pytest.raises(LogLostError, match=r"Acknowledged so far: .* in .*rescued\.jsonl"):
             log.check()
     assert read_log(*copies(path.parent), STUDY.file)[1] == done
+
+
+def test_a_log_that_is_cut_while_the_disk_is_full_does_not_grow_again(tmp_path, driven, monkeypatch):
+    """Taking a half-written line back must not fill what another program cut off with zeros."""
+    path = tmp_path / log_name(driven.header)
+    write = os.write
+
+    def full(file, data):
+        if file == log._file:
+            truncated(path)
+            raise OSError(28, "No space left on device")
+        return write(file, data)
+
+    with EventLog.create(path, STUDY.file, driven.header) as log:
+        done, _ = acknowledged(log, driven.events[:5])
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "write", full)
+            with pytest.raises(LogError):
+                log.append(driven.events[5])
+        assert acknowledged(log, driven.events[5:])[0] == []
+    assert read_log(*copies(tmp_path), STUDY.file)[1] == done
 
 
 def test_a_second_server_resumes_a_copied_log_and_the_first_stops(tmp_path, driven):

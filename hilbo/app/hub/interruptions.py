@@ -45,7 +45,8 @@ class Interruptions:
         """Log the device's state, and start to watch."""
         await self._device_changed(seen, opening=True)
         self._wall, self._steady = time.time(), time.monotonic()
-        self._spawn(self._watch_time())
+        self._spawn(self._watch("time", self._look))
+        self._spawn(self._watch("log", self.hub.check_log))
 
     def end(self) -> None:
         """Stop watching."""
@@ -106,22 +107,20 @@ class Interruptions:
                         return
                 self._unwritten.popleft()
 
-    async def _watch_time(self) -> None:
-        """Check every `_LATER` s for a laptop that slept, a closed page, and events not yet in the log."""
+    async def _watch(self, what: str, look: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Call `look` every `_LATER` s, also after it failed, and report its fault under the name `what`. Each watch is
+        a task of its own: a slow disk must not look like a laptop that slept."""
         while True:
             await asyncio.sleep(_LATER)
             try:
-                await self._look()
-                self._set_fault("time", None)
+                await look()
+                self._set_fault(what, None)
             except Exception as error:
-                self._set_fault("time", error)
+                self._set_fault(what, error)
 
     async def _look(self) -> None:
-        """One check of the clocks, of unwritten events, and of the participant's page."""
+        """One check for a laptop that slept, for unwritten events, and for the participant's page."""
         hub, now, mono = self.hub, time.time(), time.monotonic()
-        await hub.check_log()
-        if hub.lost:
-            return
         slept = max(abs((now - self._wall) - (mono - self._steady)), mono - self._steady - _LATER)
         self._wall, self._steady = now, mono
         if slept > _JUMP:

@@ -13,9 +13,11 @@ function refusePage(sentence) {
   document.body.setAttribute("role", "alert");
 }
 
-// Of the scripts that follow, a browser that is too old reports a syntax error; what is missing otherwise is looked for.
+// A browser that is too old reports a syntax error in the scripts that follow. Later ones are of data, not of scripts.
 var TOO_OLD = "This browser is too old for this page. Use Chrome or Edge 86, Firefox 98, Safari 15.4, or a newer version.";
-window.addEventListener("error", function (e) { if (e.error instanceof SyntaxError) refusePage(TOO_OLD); });
+function onError(e) { if (e.error instanceof SyntaxError) refusePage(TOO_OLD); }
+window.addEventListener("error", onError);
+document.addEventListener("DOMContentLoaded", function () { window.removeEventListener("error", onError); });
 if (!window.fetch || !window.EventSource || !window.AbortController || !window.crypto || !document.body.replaceChildren) {
   refusePage(TOO_OLD);
 }

@@ -26,13 +26,12 @@ from hilbo.study.formats.json_file import read_bytes
 __all__ = ["EventLog", "LogError", "LogLostError", "read_log", "read_session"]
 
 _MODE = 0o600
-_OPEN = (
-    os.O_RDWR | os.O_APPEND | getattr(os, "O_BINARY", 0)
-)  # appended, so that a cut file does not get a hole of zeros
+# Appended to: a write at the expected place would fill a file that was cut meanwhile with zeros, up to its old size.
+_OPEN = os.O_RDWR | os.O_APPEND | getattr(os, "O_BINARY", 0)
 
 
 class LogError(RuntimeError):
-    """An event could not be written; the log is as it was before, and everything acknowledged is in it."""
+    """An event is not on the disk, and does not count."""
 
 
 class LogLostError(LogError):
@@ -123,26 +122,27 @@ class EventLog:
         return state
 
     def check(self) -> None:
-        """Raise LogLostError if the file at the log's path is not, or at any time was not, this log as it was written.
+        """Raise LogLostError if the file at the log's path is not this log as it was written, or was not at an earlier
+        check.
 
-        The first time, the acknowledged events are copied; while that fails, it is tried again at each call.
+        The acknowledged events are copied the first time; if that fails, it is tried again at each call.
         """
         if not self._torn:
             self._fault = self._fault or fault_of(self.path, self._file, self._size)
         if not self._fault:
             return
         answers = sum(trial.status == "answered" for trial in self.state.trials)
-        kept = f"The {answers} answers acknowledged so far"
+        acknowledged = f"Acknowledged so far: {answers} answer{'' if answers == 1 else 's'}"
         try:
             self._copy = self._copy or rescue(self.path, self._lines)
         except OSError as error:
             raise LogLostError(
-                f"{self.path}: {self._fault}. {kept} are at stake: they could not be copied ({error.strerror}); make"
-                " the folder writable, and leave this server running until this message changes."
+                f"{self.path}: {self._fault}. {acknowledged}, which could not be copied ({error.strerror}) and would be"
+                " lost; make the folder writable, and leave this server running until this message changes."
             ) from error
         raise LogLostError(
-            f"{self.path}: {self._fault}, and the session has stopped. {kept} are in {self._copy}: end this server,"
-            f" compare the two, give one of them the name of the log, and go on with --resume."
+            f"{self.path}: {self._fault}, and the session has stopped. {acknowledged}, in {self._copy}; end this"
+            " server, compare the two files, give one of them the name of the log, and go on with --resume."
         )
 
     def _write(self, line):
@@ -231,9 +231,10 @@ def _folded(path, study, header, events) -> LiveSession:
 
 
 def _cut(file, size):
-    """Cut a half-written line off. Raises OSError."""
-    os.ftruncate(file, size)
-    os.fsync(file)
+    """Cut a half-written line off. Raises OSError. A file that another program made shorter does not grow again."""
+    if os.fstat(file).st_size > size:
+        os.ftruncate(file, size)
+        os.fsync(file)
 
 
 def _content(file) -> bytes:

@@ -1,15 +1,16 @@
 """Detection of a log that was deleted, moved, replaced or edited while it is open, and the copy of what it held.
 
-A log is open by its descriptor, which survives what happens to the path: events would be acknowledged into a file that
-nobody finds. The path is therefore compared with the descriptor around each write. The copy is for a person to look
-at: it has a name that no command reads as a log.
+An open descriptor survives whatever happens to the path: events would be acknowledged into a file that cannot be found
+again. The path is therefore compared with the descriptor around each write. The copy is meant for a person to inspect:
+its name is not that of a log, so that no command reads it as one.
 """
 
-import contextlib
 import os
 import secrets
 from collections.abc import Sequence
 from pathlib import Path
+
+from hilbo.study.disk.new_file import write_file
 
 __all__ = ["RESCUED", "fault_of", "rescue"]
 
@@ -36,14 +37,5 @@ def rescue(path: Path, lines: Sequence[bytes]) -> Path:
     """Write the lines of a log to a new file of mode 0600 beside it, and return its path. Raises OSError."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     copy = path.with_name(f"{path.name.split('.session')[0]}.{secrets.token_hex(4)}{RESCUED}")
-    file = os.open(copy, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o600)
-    try:
-        with os.fdopen(file, "wb") as out:
-            out.write(b"".join(lines))
-            out.flush()
-            os.fsync(out.fileno())
-    except OSError:
-        with contextlib.suppress(OSError):
-            copy.unlink()
-        raise
+    write_file(copy, b"".join(lines), replace=False)
     return copy
