@@ -66,7 +66,9 @@ def test_memory_is_set_aside_once_before_anything_is_felt_by_a_command_alone(tmp
         live.begin()
         live.question()
     assert done == [False]
-    hub, log = opened(Wanted(live.folder / "study.toml", "P02", logs=tmp_path, dry_run=True), None, lambda _: None)
+    hub, log = opened(
+        Wanted(live.folder / "study.toml", "P02", logs=tmp_path, dry_run=True), lambda *_: None, lambda _: None
+    )
     log.close()
     hub.settle()
     assert done == [False, "frozen"]

@@ -11,7 +11,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine
-from typing import Any
+from typing import Any, no_type_check
 
 from hilbo.app.interface import HubInterface
 from hilbo.app.rigs.rig import Snapshot
@@ -31,6 +31,9 @@ _GONE = 3.0  # s without a participant's page until a trial that is being felt i
 class Interruptions:
     """Watches for interruptions of a `Hub`, from `begin` to `end`."""
 
+    hub: HubInterface
+
+    @no_type_check  # at run time: a hub has no rig before it is opened
     def __init__(self, hub: HubInterface):
         self.hub = hub
         self._condition = ""  # the device's, when it was last seen

@@ -12,7 +12,7 @@ import contextlib
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, no_type_check
 
 from hilbo.app.hub.interruptions import interrupt
 from hilbo.app.interface import HubInterface
@@ -36,6 +36,9 @@ class Runner:
     """The task of a `Hub` that presents trials: `stage` is what it does now, `ends` when the step ends (s,
     monotonic)."""
 
+    hub: HubInterface
+
+    @no_type_check  # at run time: a hub has no rig before it is opened, and no runner yet
     def __init__(self, hub: HubInterface):
         self.hub = hub
         self.stage, self.trouble = "idle", ""
