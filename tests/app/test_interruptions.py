@@ -6,6 +6,7 @@ Whatever it is, nothing is lost, and what was being felt is felt again once some
 import json
 import os
 import threading
+import time
 import urllib.request
 
 import pytest
@@ -205,25 +206,25 @@ def test_a_network_that_goes_silently_is_noticed_though_the_stream_stays_open(tm
     monkeypatch.setattr(watchers, "_QUIET", QUIET)
     with Live(tmp_path, seconds=60.0) as live:
         page = Page(live)
-        live.until(lambda v: v["phase"] == "hello", live.whole)
-        page.post("begin")
-        live.until(lambda v: v["phase"] == "step", live.whole)
-        end = time.monotonic() + 1.5 * QUIET
-        while time.monotonic() < end:
+        with page.stream:
+            live.until(lambda v: v["phase"] == "hello", live.whole)
+            page.post("begin")
+            live.until(lambda v: v["phase"] == "step", live.whole)
+            end = time.monotonic() + 1.5 * QUIET
+            while time.monotonic() < end:
+                page.post("here")
+                time.sleep(0.1 * QUIET)
+            view = live.whole()
+            assert view["participant_here"]
+            assert view["phase"] == "step"
+            live.until(lambda v: not v["participant_here"], live.whole)  # nothing is closed, and nothing comes any more
+            live.until(lambda v: v["phase"] == "hello", live.whole)
+            live.until(lambda _: live.events("repeat"), live.whole)
+            live.command("pause")
+            live.command("resume")  # by the experimenter, with nobody there
+            live.until(lambda v: v["phase"] == "hello", live.whole)
             page.post("here")
-            time.sleep(0.1 * QUIET)
-        view = live.whole()
-        assert view["participant_here"]
-        assert view["phase"] == "step"
-        live.until(lambda v: not v["participant_here"], live.whole)  # nothing is closed, and nothing comes any more
-        live.until(lambda v: v["phase"] == "hello", live.whole)
-        live.until(lambda _: live.events("repeat"), live.whole)
-        live.command("pause")
-        live.command("resume")  # by the experimenter, with nobody there
-        live.until(lambda v: v["phase"] == "hello", live.whole)
-        page.post("here")
-        assert live.whole()["participant_here"]
-        live.command("pause")
-        live.command("resume")
-        live.until(lambda v: v["phase"] == "step", live.whole)
-        page.stream.close()
+            assert live.whole()["participant_here"]
+            live.command("pause")
+            live.command("resume")
+            live.until(lambda v: v["phase"] == "step", live.whole)
