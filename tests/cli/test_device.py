@@ -119,7 +119,7 @@ def test_bad_input_is_one_sentence(device, tmp_path, monkeypatch, arguments, cod
         ("set_id,K1,B1,alpha\nA,1,2,x\n", 'sets.csv:2: alpha is "x"; it must be a finite number'),
         ("set_id,K1,B1,alpha,N\nA,1,2,0.5,1.5\n", "N is"),
         ("set_id,K1,B1,alpha\nA,1,2,0.5\nA,1,2,0.5\n", "stands there already"),
-        ("set_id,K1,B1,alpha\nA,1,2\n", "has 3 cells and the header 4"),
+        ("set_id,K1,B1,alpha\nA,1,2\n", "has 3 cells, the header has 4"),
         ("set_id,K1,B1,alpha\nA,1,2,\n", 'alpha is ""'),
     ],
 )

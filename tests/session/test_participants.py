@@ -18,14 +18,14 @@ def person(name, consent="2026-05-04T10:15"):
 
 
 def test_several_who_add_at_once_lose_nobody(tmp_path, monkeypatch):
-    real = participants.read_people
+    real = participants._read
 
     def slow(path):
         people = real(path)
         time.sleep(0.03)  # so that all others read before one has written, if nothing holds them
         return people
 
-    monkeypatch.setattr(participants, "read_people", slow)
+    monkeypatch.setattr(participants, "_read", slow)
     path = tmp_path / "new" / "participants.csv"
     threads = [threading.Thread(target=add_person, args=(path, person(f"P{i}"))) for i in range(6)]
     for thread in threads:

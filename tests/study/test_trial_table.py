@@ -47,7 +47,7 @@ NO_TABLES = {
         ((HEADER + '"A,1,close,1,2\n').encode(), "has a quotation mark that nothing closes; remove it, or close it."),
         (
             (HEADER.replace("gain", "Gain ") + "A,1,close,1,2\n").encode(),
-            '1: column "gain" is missing (there is "Gain ")',
+            '1: column "gain" is missing (there is "Gain")',
         ),
     ],
     "t.xlsx": [(b"PK\x03\x04", "is a spreadsheet; save it as CSV, by the spreadsheet's own menu.")],

@@ -122,7 +122,7 @@ def test_sets_are_read(tmp_path):
         ("x,sysid,5,1.5,0.001", ':3: N is "1.5"'),
         ("x,sysid,5,101,0", ':3: T is "0"; it must be a time above 0, in s'),
         ("x,sysid,1_5,101,0.001", ':3: K1 is "1_5"; it must be a finite number'),
-        ("x,sysid,5,101", ":3: has 4 cells and the header 5"),
+        ("x,sysid,5,101", ":3: has 4 cells, the header has 5"),
     ],
 )
 def test_a_bad_set_is_named(tmp_path, row, sentence):

@@ -4,18 +4,16 @@ Columns: participant, consent_time (ISO 8601), protocol_number, optional age and
 and the protocol's number must stand there before the first trial.
 """
 
-import csv
 import datetime
-import io
 import os
 from collections.abc import Mapping
-from itertools import zip_longest
 from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.study.disk.lock import locked_folder
 from hilbo.study.disk.new_file import rewrite_file
-from hilbo.study.formats.cell_text import but_for_case, check_id, check_text, csv_rows
+from hilbo.study.formats.cell_text import but_for_case, check_id, check_text
+from hilbo.study.formats.csv_rows import csv_text, open_csv
 
 __all__ = ["COLUMNS", "add_person", "check_consent", "read_people"]
 
@@ -27,49 +25,39 @@ People = dict[str, dict[str, str]]
 
 def read_people(path: str | os.PathLike) -> People:
     """participant -> row. Raises InputError with the line of what is wrong."""
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader, _ = csv_rows(file, str(path))
-            rows = [(reader.line_num, row) for row in reader if any(row)]
-            columns = rows.pop(0)[1] if rows else []
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: is no table that can be read ({error}); save it as CSV in UTF-8.") from error
-    twice = next((name for name in columns if columns.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f'{path}:1: column "{twice}" stands there twice; give each column a name of its own.')
-    missing = [name for name in _NEEDED if name not in columns]
-    if missing:
-        raise InputError(
-            f'{path}:1: column "{missing[0]}" is missing; a list of participants has {", ".join(_NEEDED)}.'
-        )
+    return _read(path)[0]
+
+
+def _read(path: str | os.PathLike) -> tuple[People, str]:
+    """The people of a list, and its delimiter."""
+    needs = f"a list of participants has {', '.join(_NEEDED)}"
     people: People = {}
-    for line, row in rows:
-        if len(row) > len(columns):
-            raise InputError(f"{path}:{line}: has {len(row)} cells, the header has {len(columns)}; fix that line.")
-        person = {key: value.strip() for key, value in zip_longest(columns, row, fillvalue="")}
-        _check(person, f"{path}:{line}")
-        if not person["participant"]:
-            raise InputError(f"{path}:{line}: participant is empty; give each row a participant.")
-        if person["participant"] in people:
-            raise InputError(f"{path}:{line}: participant {person['participant']} stands there twice; keep one row.")
-        people[person["participant"]] = person
-    return people
+    with open_csv(path, needs, fill=True) as table:
+        missing = [name for name in _NEEDED if name not in table.header]
+        if missing:
+            raise InputError(f'{path}:1: column "{missing[0]}" is missing; {needs}.')
+        for line, row in table.rows:
+            person = {key: value.strip() for key, value in zip(table.header, row, strict=True)}
+            _check(person, f"{path}:{line}")
+            if person["participant"] in people:
+                raise InputError(
+                    f"{path}:{line}: participant {person['participant']} stands there twice; keep one row."
+                )
+            people[person["participant"]] = person
+    return people, table.delimiter
 
 
 def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
     """Add a row, and write the table anew, whole or not at all; with its folder. One hilbo after the other, and where
     the path is a link, in the place that it leads to. Raises InputError."""
     person = {key: str(value).strip() for key, value in row.items()}
-    _check_words(person, str(path))
     _check(person, str(path))
     _check_past(person, str(path))
     place = _place(Path(path))
     try:
         place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with locked_folder(place.parent):
-            people = read_people(path) if place.exists() else {}
+            people, delimiter = _read(path) if place.exists() else ({}, ",")
             if person["participant"] in people:
                 raise InputError(
                     f"{path}: participant {person['participant']} stands there already; choose another id."
@@ -77,7 +65,7 @@ def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
             if alike := but_for_case([*people, person["participant"]]):
                 raise InputError(f"{path}: {alike} differ in capitals only; choose another id.")
             people[person["participant"]] = person
-            _write(place, people, _delimiter(place))
+            _write(place, people, delimiter)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place.") from error
     return people
@@ -110,15 +98,11 @@ def check_consent(people: People, participant: str, protocol_number: str = "") -
     return row
 
 
-def _check_words(row, place):
-    """The rules for ids and words, for what comes in; a list that stands may hold what earlier versions took."""
+def _check(row, place):
     check_id(row.get("participant", ""), place)
     for name, text in row.items():
         check_text(name, "the name of a column", place)
         check_text(text, name, place)
-
-
-def _check(row, place):
     if row.get("consent_time"):
         try:
             datetime.datetime.fromisoformat(row["consent_time"])
@@ -141,17 +125,7 @@ def _check_past(row, place):
         raise InputError(f"{place}: consent_time is {row['consent_time']}, which is to come; write when they agreed.")
 
 
-def _delimiter(path) -> str:
-    """What stands between the cells of a list that is there already."""
-    if not Path(path).exists():
-        return ","
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        return csv_rows(file, str(path))[1]
-
-
 def _write(path, people, delimiter):
     columns = list(dict.fromkeys((*COLUMNS, *(key for row in people.values() for key in row))))
     rows = [[row.get(column, "") for column in columns] for row in people.values()]
-    text = io.StringIO()
-    csv.writer(text, delimiter=delimiter, lineterminator="\n").writerows([columns, *rows])
-    rewrite_file(path, text.getvalue())
+    rewrite_file(path, csv_text([columns, *rows], delimiter))

@@ -8,8 +8,8 @@ taken for a name: an id such as 1 or a is also a session's label, a number, or a
 """
 
 import contextlib
-import csv
 import io
+import itertools
 import json
 import re
 import shlex
@@ -22,7 +22,7 @@ import msgspec
 from hilbo.errors import InputError
 from hilbo.session.plan.plan import plan_hash
 from hilbo.session.plan.set_codes import OWN
-from hilbo.study.formats.cell_text import csv_rows
+from hilbo.study.formats.csv_rows import csv_rows, csv_text
 from hilbo.study.tables.parameter_sets import ROLES
 
 __all__ = [
@@ -78,10 +78,9 @@ def read_table(path: Path) -> Cells | None:
 
             frame = read_cells(path)
             return Cells(list(map(str, frame.columns)), frame.to_numpy().tolist())
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader, delimiter = csv_rows(file, str(path))
-            rows = list(reader)
-    except (OSError, UnicodeDecodeError, csv.Error, InputError):
+        with csv_rows(path) as (every, delimiter):
+            rows = list(itertools.dropwhile(lambda cells: not any(cells), (cells for _, cells in every)))
+    except InputError:
         return None
     return Cells(rows[0], rows[1:], delimiter) if rows else None
 
@@ -97,10 +96,7 @@ def table_content(path: Path, edited: Edited) -> bytes:
                 frame[column] = [row[i] for row in edited.table.rows]
         frame.to_parquet(content, index=False)
         return content.getvalue()
-    text = io.StringIO()
-    writer = csv.writer(text, delimiter=edited.table.delimiter, lineterminator="\n")
-    writer.writerows([edited.table.head, *edited.table.rows])
-    return text.getvalue().encode()
+    return csv_text([edited.table.head, *edited.table.rows], edited.table.delimiter).encode()
 
 
 def named_sets(table: Cells) -> set[str]:

@@ -146,7 +146,8 @@ def spelled(text: str, suffix: str, participant: str, exact: bool = False) -> st
 def _in_columns(text: str, is_id: Callable[[str], bool], delimiter: str) -> str:
     """A whole cell of a column of ids that is this id."""
     try:
-        rows = list(csv.reader(io.StringIO(text.lstrip("\ufeff")), delimiter=delimiter, skipinitialspace=True))
+        reader = csv.reader(io.StringIO(text.lstrip("\ufeff")), delimiter=delimiter, skipinitialspace=True)
+        rows = [row for row in reader if any(row)]
     except csv.Error:
         return ""
     columns = [i for i, name in enumerate(rows[0] if rows else []) if _ID_COLUMN.fullmatch(name.strip())]

@@ -1,4 +1,4 @@
-"""The rule for participants' ids, the one for text in the cells of a table, and what stands between those cells.
+"""The rule for participants' ids, and the one for text in the cells of a table.
 
 Loads no JAX, no pandas.
 
@@ -7,12 +7,10 @@ comes in, and writes every text as it is: a mark put before it would be another 
 no such text.
 """
 
-import csv
 import re
 from collections.abc import Iterable
-from typing import Any, TextIO
 
-from hilbo.errors import InputError, warn_caller
+from hilbo.errors import InputError
 
 __all__ = [
     "FORMULA_WORDS",
@@ -20,13 +18,11 @@ __all__ = [
     "but_for_case",
     "check_id",
     "check_text",
-    "csv_rows",
     "formulas",
     "is_decimal",
     "is_id",
     "no_ids",
     "runs_in_a_spreadsheet",
-    "say_delimiter",
     "without_decimal_comma",
 ]
 
@@ -34,8 +30,6 @@ _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 ID_WORDS = 'an id has up to 32 letters, digits, "_", "-", ".", begins with a letter or digit, and is nobody\'s name'
 FORMULA_WORDS = "which a spreadsheet would run as a formula; begin it with a letter or a digit"
 _NUMERAL = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?")
-_QUOTED = re.compile(r'"[^"]*"')
-_DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 _DASHES = "-+ \t\r\n"
 _BEGINS = ("=", "@", "+", "-", "\t", "\r", "\n", "＝", "＠", "＋", "－")  # noqa: RUF001 (some spreadsheets take these too)
 
@@ -80,23 +74,6 @@ def check_text(text: str, name: str, place: str = "") -> None:
     """Refuse text that a spreadsheet would run; `name` says what it is, `place` where it stands."""
     if runs_in_a_spreadsheet(text):
         raise InputError(f'{place + ": " if place else ""}{name} is "{text}", {FORMULA_WORDS}.')
-
-
-def csv_rows(file: TextIO, source: str) -> tuple[Any, str]:
-    """The reader of a CSV table, and what stands between its cells: of comma, semicolon and tab what its header has
-    most of. Blanks before a cell are none of it. Raises `InputError` for a first line that only spreadsheets read."""
-    header = next((line for line in file if line.strip()), "")
-    if header.lower().startswith("sep="):
-        raise InputError(f'{source}:1: is "{header.strip()}", which only spreadsheets read; delete that line.')
-    file.seek(0)
-    delimiter = max(_DELIMITERS, key=_QUOTED.sub("", header).count)
-    return csv.reader(file, delimiter=delimiter, skipinitialspace=True, strict=True), delimiter
-
-
-def say_delimiter(delimiter: str, source: str) -> None:
-    """Warn where it is no comma: a comma in a number is then the decimal point."""
-    if delimiter != ",":
-        warn_caller(f"{source}: is read with {_DELIMITERS[delimiter]} between its cells; 1,5 is one and a half.")
 
 
 def is_decimal(cell: str, mark: str) -> bool:

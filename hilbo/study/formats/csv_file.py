@@ -1,11 +1,11 @@
 """Cells of a table, CSV or Parquet, as text; and columns of them as numbers.
 
-A number means what its decimals say (correctly rounded). A CSV table has commas, or, as spreadsheets of many countries
-write it, semicolons; then a comma in a number is the decimal point, and a warning says so. A table is read piece by
-piece. Whatever is wrong is one sentence with the file and the line (Parquet: row).
+A number means what its decimals say (correctly rounded). Where a CSV table has semicolons or tabs between its cells, a
+comma in a number is the decimal point, and a warning says so. A table is read piece by piece. Whatever is wrong is one
+sentence with the file and the line (Parquet: row).
 """
 
-import csv
+import itertools
 import math
 import os
 import re
@@ -17,7 +17,8 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.search.box import Parameter
-from hilbo.study.formats.cell_text import csv_rows, is_decimal, say_delimiter, without_decimal_comma
+from hilbo.study.formats.cell_text import is_decimal, without_decimal_comma
+from hilbo.study.formats.csv_rows import check_header, open_csv, read_errors, say_delimiter
 
 __all__ = [
     "FRAME",
@@ -35,8 +36,6 @@ FRAME = "DataFrame"
 """What a table that is in memory is called in sentences."""
 
 _PIECE = 50_000  # rows
-_SPREADSHEETS = (".xlsx", ".xls", ".ods")
-_SPREADSHEET = "is a spreadsheet; save it as CSV, by the spreadsheet's own menu"
 
 
 def read_cells(path: str | os.PathLike, needs: str = "a trial table needs a header and an answer") -> pd.DataFrame:
@@ -51,46 +50,16 @@ def cell_pieces(
     path: str | os.PathLike, needs: str = "a trial table needs a header and an answer"
 ) -> Iterator[pd.DataFrame]:
     """The cells of a table as text, some rows at a time; at least one piece, which may have none."""
-    source, path = str(path), Path(path)
-    if path.suffix.lower() in _SPREADSHEETS and path.is_file():
-        raise InputError(f"{source}: {_SPREADSHEET}.")
-    try:
-        for frame in _parquet_pieces(path) if path.suffix == ".parquet" else _csv_pieces(path, source, needs):
-            again = frame.columns[frame.columns.duplicated()]
-            if len(again):
-                raise InputError(f'{place(source)}column "{again[0]}" stands there twice; keep one of them.')
-            yield frame
-    except InputError:
-        raise
-    except OSError as error:
-        why = error.strerror or ("it is a stream, and no file" if "seekable" in str(error) else error)
-        raise InputError(f"{source}: cannot be read ({why}); check the path.") from error
-    except (ValueError, csv.Error) as error:  # pyarrow's errors, and text that is no UTF-8, are ValueErrors
-        raise InputError(f"{source}: {_unreadable(path, error)}.") from error
-
-
-def _unreadable(path: Path, error: Exception) -> str:
-    """Why a file is no table, and what to do."""
-    with path.open("rb") as file:
-        begin = file.read(4)
-    if begin == b"PK\x03\x04":
-        return _SPREADSHEET
-    if isinstance(error, UnicodeDecodeError):
-        kind = "is UTF-16 text" if begin[:2] in (b"\xff\xfe", b"\xfe\xff") else "is no UTF-8 text"
-        return f"{kind}; save the table as CSV with the encoding UTF-8"
-    if isinstance(error, csv.Error) and "unexpected end of data" in str(error):
-        return "has a quotation mark that nothing closes; remove it, or close it"
-    reason = str(error).strip().splitlines()[-1]
-    return f"is not a table that can be read ({reason}); save it as CSV or Parquet"
+    path = Path(path)
+    with read_errors(path):
+        yield from _parquet_pieces(path) if path.suffix == ".parquet" else _csv_pieces(path, needs)
 
 
 def cells_of(frame: pd.DataFrame) -> pd.DataFrame:
     """The cells of a table in memory as text, its rows counted from 1. Raises `InputError` for what is none."""
     if not isinstance(frame, pd.DataFrame):
         raise InputError(f"{FRAME}: this is a {type(frame).__name__}; give a pandas DataFrame.")
-    again = frame.columns[frame.columns.duplicated()]
-    if len(again):
-        raise InputError(f'{place(FRAME)}column "{again[0]}" stands there twice; keep one of them.')
+    check_header(list(frame.columns), FRAME)
     return _as_text(frame, 1)
 
 
@@ -99,6 +68,7 @@ def _parquet_pieces(path: Path) -> Iterator[pd.DataFrame]:
     from pyarrow.parquet import ParquetFile
 
     with ParquetFile(path) as file:
+        check_header(file.schema_arrow.names, str(path))
         first_row = 1
         yield _as_text(file.schema_arrow.empty_table().to_pandas(), first_row)
         for batch in file.iter_batches(_PIECE):
@@ -107,9 +77,8 @@ def _parquet_pieces(path: Path) -> Iterator[pd.DataFrame]:
 
 
 def _as_text(frame: pd.DataFrame, first_row: int) -> pd.DataFrame:
-    columns = {i: _column_as_text(frame.iloc[:, i]) for i in range(frame.shape[1])}  # a name may stand there twice
     index = np.arange(first_row, first_row + len(frame))
-    return pd.DataFrame(columns, index=index, dtype=object).set_axis(frame.columns, axis=1)
+    return pd.DataFrame({name: _column_as_text(frame[name]) for name in frame}, index=index, dtype=object)
 
 
 def _column_as_text(column: pd.Series) -> list[str]:
@@ -120,36 +89,15 @@ def _column_as_text(column: pd.Series) -> list[str]:
     return ["" if missing else str(v) for v, missing in zip(values, column.isna().tolist(), strict=True)]
 
 
-def _csv_pieces(path: Path, source: str, needs: str) -> Iterator[pd.DataFrame]:
-    """By Python's csv module: it knows the line of a row, and a row that is too long is no reason to guess."""
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader, delimiter = csv_rows(file, source)
-        say_delimiter(delimiter, source)
-        rows, lines, header, line, pieces = [], [], [], 1, 0
-        for row in reader:
-            if any(row):  # not an empty line, nor a spreadsheet's row of commas
-                header = header or row
-                if len(row) != len(header):
-                    raise InputError(
-                        f"{source}:{line}: has {len(row)} cells, the header has {len(header)}; fix that line."
-                    )
-                rows.append(row)
-                lines.append(line)
-                if len(rows) > _PIECE:
-                    yield _piece(rows, lines, header, pieces, delimiter)
-                    rows, lines, pieces = [], [], pieces + 1
-            line = reader.line_num + 1
-        if not header:
-            raise InputError(f"{source}: is empty; {needs}.")
-        if rows:
-            yield _piece(rows, lines, header, pieces, delimiter)
-
-
-def _piece(rows: list[list[str]], lines: list[int], header: list[str], pieces: int, delimiter: str) -> pd.DataFrame:
-    skip = 0 if pieces else 1  # the first row of the first piece is the header
-    frame = pd.DataFrame(rows[skip:], index=lines[skip:], columns=header, dtype=object)
-    frame.attrs["decimal comma"] = delimiter != ","
-    return frame
+def _csv_pieces(path: Path, needs: str) -> Iterator[pd.DataFrame]:
+    with open_csv(path, needs) as table:
+        say_delimiter(table.delimiter, str(path))
+        pieces = iter(lambda: [*itertools.islice(table.rows, _PIECE)], [])
+        for rows in itertools.chain([next(pieces, [])], pieces):  # a table without rows has columns too
+            lines, cells = [line for line, _ in rows], [row for _, row in rows]
+            frame = pd.DataFrame(cells, index=lines, columns=table.header, dtype=object)
+            frame.attrs["decimal comma"] = table.delimiter != ","
+            yield frame
 
 
 def place(source: str, row: object = None) -> str:

@@ -5,17 +5,17 @@ force_limit and others, which are kept as text. Units: K N/mm, B1 N·s^α/mm, T 
 reads sets on machines that have little time for it.
 """
 
-import csv
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from hilbo.errors import InputError
-from hilbo.study.formats.cell_text import check_id, check_text, csv_rows, say_delimiter, without_decimal_comma
+from hilbo.study.formats.cell_text import check_id, check_text, without_decimal_comma
+from hilbo.study.formats.csv_rows import Rows, open_csv, say_delimiter
 
 __all__ = ["ROLES", "read_sets", "role_of", "source_kind", "source_of"]
 
@@ -39,10 +39,7 @@ def read_sets(
     their `levels`. Raises `InputError`, one sentence with file and line.
     """
     source = str(path)
-    columns, rows, comma = _table(Path(path), source)
-    again = [name for name in columns if columns.count(name) > 1]
-    if again:
-        raise InputError(f'{source}:1: column "{again[0]}" stands there twice; keep one of them.')
+    columns, rows, comma = _table(Path(path))
     for name in columns:
         check_text(name, "the name of a column", f"{source}:1")
     missing = [name for name in ("set_id", *needs) if name not in columns]
@@ -53,8 +50,6 @@ def read_sets(
     sets: dict[str, dict[str, Any]] = {}
     for line, cells in rows:
         place = f"{source}:{line}"
-        if len(cells) != len(columns):
-            raise InputError(f"{place}: has {len(cells)} cells and the header {len(columns)}; fill the row up.")
         given = {column: cell.strip() for column, cell in zip(columns, cells, strict=True)}
         name = given.pop("set_id")
         if not name:
@@ -96,23 +91,16 @@ def source_of(name: str, material: str | None = None) -> str:
     return last if source_kind(last) else "aggregate"
 
 
-def _table(path: Path, source: str) -> tuple[list[str], Iterator[tuple[int, list[str]]], bool]:
+def _table(path: Path, needs: str = "a sets table needs a header and a parameter set") -> tuple[list[str], Rows, bool]:
     """Column names, each row's line and cells as text, and whether a comma may be the decimal point."""
     if path.suffix == ".parquet":
         from hilbo.study.formats.csv_file import read_cells
 
-        frame = read_cells(path, "a sets table needs a header and a parameter set")
+        frame = read_cells(path, needs)
         return list(frame.columns), zip(frame.index, frame.to_numpy().tolist(), strict=True), False
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader, delimiter = csv_rows(file, source)
-            say_delimiter(delimiter, source)
-            rows = [(reader.line_num, cells) for cells in reader if cells]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{source}: cannot be read ({error}); a sets table is a CSV file.") from error
-    if not rows:
-        raise InputError(f"{source}: is empty; a sets table needs a header and a parameter set.")
-    return [name.strip() for name in rows[0][1]], iter(rows[1:]), delimiter != ","
+    with open_csv(path, needs) as table:
+        say_delimiter(table.delimiter, str(path))
+        return table.header, iter(list(table.rows)), table.delimiter != ","
 
 
 def _value(
