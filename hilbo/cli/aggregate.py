@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from hilbo.cli.terminal.console import Force, Json, Out, finish, progress, remark, results, seed_option, start
-from hilbo.errors import InputError
+from hilbo.errors import InputError, warn_caller
 from hilbo.population.rules.registry import GIVEN, RECIPES, RULES
 from hilbo.report.figures.painter import begin_painter
 
@@ -130,37 +130,27 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
     from hilbo.study.tables.trials import trial_table
 
     whole = Study.load(study)
-    material = material or _only_material(trials, whole.file)
-    chosen = whole.material(material) if material and whole.file.materials else whole
     if trials.is_dir():
-        from hilbo.session.export.tables import read_log_trials
+        from hilbo.session.export.tables import log_cells
 
-        table = read_log_trials(trials, whole.file, material, others=False, note=remark)
+        pieces, note, note_rows = log_cells(trials, whole.file, remark), remark, lambda rows: None
     else:
-        table = trial_table(
-            cell_pieces(trials),
-            chosen.file,
-            material,
-            source=str(trials),
-            others=False,
-            say=lambda rows: say("rows read", rows),
-        )
+        pieces, note, note_rows = cell_pieces(trials), warn_caller, lambda rows: say("rows read", rows)
+    if whole.file.materials and material is None:
+        pieces = list(pieces)
+        material = _only_material(pieces, trials)
+    chosen = whole.material(material) if material and whole.file.materials else whole
+    table = trial_table(pieces, chosen.file, material, source=str(trials), others=False, say=note_rows, note=note)
     return chosen, cohort_of(table, chosen), flag_sentences_of(table.flags, chosen.file.exclude_flags)
 
 
-def _only_material(trials: Path, study: Any) -> str | None:
-    """The material that a table or the logs are of, where the study has several; None where they name none."""
-    if not study.materials:
-        return None
-    from hilbo.session.export.tables import read_sessions, trials_table
-    from hilbo.study.formats.csv_file import read_cells
-
-    table = trials_table(read_sessions(trials, study)) if trials.is_dir() else read_cells(trials)
-    named = list(dict.fromkeys(table["material"])) if "material" in table else []
+def _only_material(pieces: list[Any], source: Path) -> str | None:
+    """The material that the cells of a study of several materials are of; None where they name none."""
+    named = list(dict.fromkeys(name for cells in pieces if "material" in cells for name in cells["material"]))
     if len(named) > 1:
-        raise InputError(f"{trials}: holds {len(named)} materials ({', '.join(named)}); choose one with --material.")
+        raise InputError(f"{source}: holds {len(named)} materials ({', '.join(named)}); choose one with --material.")
     if not named:
-        remark(f"{trials}: names no material; it is read by the study's own tables, and none of [materials].")
+        remark(f"{source}: names no material; it is read by the study's own tables, and none of [materials].")
     return named[0] if named else None
 
 

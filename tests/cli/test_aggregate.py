@@ -8,6 +8,8 @@ from hilbo.cli.aggregate import _at_once, _included, read_cohort
 from hilbo.errors import InputError
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
+from hilbo.study.formats import csv_file
+from hilbo.study.formats.csv_rows import open_csv
 
 STUDY = """schema = 1
 [study]
@@ -49,6 +51,13 @@ def test_a_table_of_two_materials_or_of_an_unknown_one_is_refused(read):
         read("participant,trial,response,u,material\nA,1,yes,1,gel\nA,1,no,1,foam\n")
     with pytest.raises(InputError, match=r"materials\.silk is not in the study, its materials: gel, foam"):
         read("participant,trial,response,u,material\nA,1,yes,1,silk\n")
+
+
+def test_a_table_is_opened_once(read, monkeypatch):
+    opened = []
+    monkeypatch.setattr(csv_file, "open_csv", lambda path, needs: opened.append(path) or open_csv(path, needs))
+    read("participant,trial,response,u,material\nA,1,yes,4.0,gel\n")
+    assert len(opened) == 1
 
 
 def test_a_table_of_no_material_says_so(read, capsys):

@@ -3,7 +3,8 @@
 `trials_table` is a trial table (every answer to one rendering; voided and undone ones marked so), `validation_table`
 and `sets_table` are those of `hilbo.study.tables.validation` (voided comparisons left out), `presentations_table` has
 every trial that was ever proposed, and what became of it, `sessions_table` the plan that each session was held by.
-`read_log_trials` checks the texts of these cells as those of a file are, so that both give the same bits.
+`log_cells` are the cells of `trials_table` as text, which are checked as those of a file are, so that both give the same
+bits.
 """
 
 import os
@@ -29,6 +30,7 @@ from hilbo.study.tables.trials import TrialTable, trial_table
 
 __all__ = [
     "computes_sets",
+    "log_cells",
     "presentations_table",
     "read_log_trials",
     "read_sessions",
@@ -196,20 +198,27 @@ def sessions_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def log_cells(
+    folder: str | os.PathLike, study: StudyFile, note: Callable[[str], object] = lambda sentence: None
+) -> list[pd.DataFrame]:
+    """The cells of the trial table of a folder of session logs, as text and in one piece; `study` is the whole one, of
+    all materials."""
+    table = trials_table(read_sessions(folder, study, note))
+    if table.empty:
+        raise InputError(f"{folder}: its sessions hold no answers yet; nothing can be aggregated.")
+    return [cells_of(table)]
+
+
 def read_log_trials(
     folder: str | os.PathLike,
     study: StudyFile,
     material: str | None = None,
     *,
-    others: bool = True,
     note: Callable[[str], object] = lambda sentence: None,
 ) -> TrialTable:
     """The trial table of a folder of session logs; `study` is the whole one, of all materials. See `trial_table`."""
-    table = trials_table(read_sessions(folder, study, note))
-    if table.empty:
-        raise InputError(f"{folder}: its sessions hold no answers yet; nothing can be aggregated.")
     chosen = study.material(material) if material and study.materials else study
-    return trial_table([cells_of(table)], chosen, material, source=str(folder), others=others, note=note)
+    return trial_table(log_cells(folder, study, note), chosen, material, source=str(folder), note=note)
 
 
 def _written(text: Any) -> Any:
