@@ -3,8 +3,7 @@
 `trials_table` is a trial table (every answer to one rendering; voided and undone ones marked so), `validation_table`
 and `sets_table` are those of `hilbo.study.tables.validation` (voided comparisons left out), `presentations_table` has
 every trial that was ever proposed, and what became of it, `sessions_table` the plan that each session was held by.
-`log_cells` are the cells of `trials_table` as text, which are checked as those of a file are, so that both give the same
-bits.
+`log_cells` are the cells of `trials_table` as text, which are checked as those of a file are; both give the same bits.
 """
 
 import os
