@@ -1,7 +1,9 @@
 """What a notebook meets: mistakes in one sentence, and records whose words are short."""
 
+import copy
 import importlib
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -433,6 +435,15 @@ def test_records_have_short_words(posterior, session):
     assert repr(posterior.gp.likelihood) == "OrdinalProbit(thresholds=[-0.5, 0.5], noise=0.5)"
     assert re.fullmatch(r'Session\("plain": 0 of \d+ answers, asks u [\d.]+, v [\d.]+\)', repr(session))
     assert repr(session.study).startswith('Study("plain": u 0 to 1, v 10 to 20; ')
+
+
+@pytest.mark.parametrize("duplicate", [lambda posterior: pickle.loads(pickle.dumps(posterior)), copy.deepcopy])
+def test_a_posterior_that_was_saved_predicts_the_same(posterior, duplicate):
+    same = duplicate(posterior)
+    for one, other in zip(jax.tree.leaves(posterior), jax.tree.leaves(same), strict=True):
+        np.testing.assert_array_equal(one, other)
+    x = np.array([[0.2, 0.7]])
+    np.testing.assert_array_equal(same.predict(x), posterior.predict(x))
 
 
 @pytest.mark.parametrize("module", [bcm, passivity, viscoelastic])

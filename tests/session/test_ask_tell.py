@@ -1,6 +1,8 @@
 """Ask and tell: one compilation, the same points again, inside the passive set."""
 
+import copy
 import json
+import pickle
 import subprocess
 import sys
 
@@ -80,6 +82,36 @@ def test_replay_gives_the_same_points_bit_for_bit(study, finished):
     np.testing.assert_array_equal(again.points, session.points)
     halfway = Session.replay(study, responses[:12], seed=3)
     assert halfway.ask() == asked[12]
+
+
+def pickled(what):
+    return pickle.loads(pickle.dumps(what))
+
+
+@pytest.mark.parametrize("duplicate", [pickled, copy.deepcopy, copy.copy])
+def test_a_session_that_is_saved_after_every_answer_goes_on_as_one_that_is_not(duplicate):
+    session, saved = Session.start(SMALL, seed=3), duplicate(Session.start(SMALL, seed=3))
+    for response in ["similar", "different", "close", "close", "similar", "different"]:
+        assert saved.ask() == session.ask()
+        session, saved = session.tell(response), duplicate(saved.tell(response))
+    assert saved.done
+    assert saved.best() == session.best()
+    assert saved.step.compiled is session.step.compiled  # nothing is compiled again
+    for array in (saved.points, saved.answers, duplicate(Session.start(SMALL)).proposal):
+        assert not array.flags.writeable
+
+
+@deep  # which imports and traces all
+def test_a_pickled_session_goes_on_in_another_process(tmp_path):
+    session = Session.replay(SMALL, ["similar", "different", "close"], seed=3)
+    (tmp_path / "session.pickle").write_bytes(pickle.dumps(session))
+    code = (
+        "import jax, json, pickle; jax.config.update('jax_enable_x64', True)\n"
+        f"session = pickle.loads(open({str(tmp_path / 'session.pickle')!r}, 'rb').read())\n"
+        "print(json.dumps([session.ask(), session.tell('close').ask()]))"
+    )
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == [session.ask(), session.tell("close").ask()]
 
 
 @deep  # which imports and traces all

@@ -70,6 +70,10 @@ class Session:
             asked = ", asks " + ", ".join(f"{p.name} {p.words(value)} {p.unit}".rstrip() for p, value in values)
         return f'Session("{self.study.file.name}": {len(self.answers)} of {of} answers{asked})'
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickles and copies contain the data of a session; its compiled step is made again."""
+        return _restored, (self.study, self.plan, self.points, self.answers, self.proposal, self.seed)
+
     @classmethod
     def start(cls, study: Study, seed: int = 0) -> "Session":
         """A session without answers. The seed decides the space-filling trials and the candidates.
@@ -174,6 +178,14 @@ def _in_its_digits(parameter: Parameter, value: Any) -> float:
         return parameter.number(str(value))
     dtype = getattr(value, "dtype", np.dtype(float))
     return float(str(value)) if dtype.kind == "f" and dtype.itemsize < 8 else float(value)
+
+
+def _restored(
+    study: Study, plan: Design, points: np.ndarray, answers: np.ndarray, proposal: np.ndarray | None, seed: int
+) -> Session:
+    """The session with these data. Copies of read-only arrays are writable until they are made read-only again."""
+    _read_only(points, answers, *([] if proposal is None else [proposal]))
+    return Session(study, plan, points, answers, proposal, seed, Step(study, plan))
 
 
 def _read_only(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:

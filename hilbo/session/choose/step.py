@@ -62,6 +62,10 @@ class Step:
         blank = padding(study, self.capacity).ravel()
         self._blank = np.concatenate([np.zeros(_FACTS + self.capacity), blank])
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Compiled programs cannot be pickled; a copy finds or compiles its own."""
+        return type(self), (self._study, self._plan)
+
     @property
     def compiled(self) -> Any:
         """The program behind it; where none are kept, shared by all studies that differ in numbers only."""
