@@ -68,7 +68,7 @@ def pages(tmp_path, request):
         window = program.new_context().new_page()
 
         def watch():
-            return experimenter.evaluate("fetch('/api/experimenter').then(r => r.json())")
+            return experimenter.evaluate("server.ask('/api/experimenter').then(r => r.json())")
 
         participant = Participant(
             window, links["participant"], watch, lambda _, ask: "a" if ask == "preferred" else "close"
@@ -468,7 +468,7 @@ def test_a_session_in_a_browser_of_some_years_ago(tmp_path):
         windows["experimenter"].wait_for_url("**/experimenter")
 
         def watch():
-            return windows["experimenter"].evaluate("fetch('/api/experimenter').then(r => r.json())")
+            return windows["experimenter"].evaluate("server.ask('/api/experimenter').then(r => r.json())")
 
         participant = Participant(windows["participant"], links["participant"], watch, lambda _, ask: "close")
         until_answered(participant, 2)

@@ -157,9 +157,9 @@ def test_what_a_participant_asks_for_in_one_piece_is_answered_turn_by_turn(serve
 
 @pytest.mark.parametrize("length", [5_000, 15_000])
 def test_a_key_behind_cookies_of_other_programs_is_seen(server, brief, length):
-    cookie = f"Cookie: other={'x' * length}; hilbo_experimenter_{server.port}={server.experimenter._key}\r\n\r\n"
+    more = f"Cookie: other={'x' * length}\r\nAuthorization: Bearer {server.experimenter._key}\r\n\r\n"
     with connected(server.port) as stream:
-        stream.sendall(request(server, "/api/experimenter/events")[:-2] + cookie.encode())
+        stream.sendall(request(server, "/api/experimenter/events")[:-2] + more.encode())
         until_words(stream, b"event: view")
         with pytest.raises(TimeoutError):
             patient(stream, 0.3).recv(1)

@@ -3,14 +3,12 @@
 Whatever it is, nothing is lost, and what was being felt is felt again once somebody presses Begin.
 """
 
-import json
 import os
 import threading
 import time
-import urllib.request
 
 import pytest
-from live_server import PATIENCE, Live, ask, refused
+from live_server import Live, ask, refused
 
 from hilbo.app.rehearsal.robot import Client
 from hilbo.app.wire import security, watchers
@@ -185,19 +183,15 @@ QUIET = 1.5  # s that a page may be silent here
 
 
 class Page:
-    """A participant's window without a browser: a cookie, a stream, and signs of life as long as it is told to."""
+    """A participant's window without a browser: a key, a stream, and signs of life as long as it is told to."""
 
     def __init__(self, live):
-        self.live, self.origin = live, live.participant.address
-        token = live.place.link("participant").partition("/#")[2]
-        request = urllib.request.Request(self.origin + "/api/join", data=json.dumps({"token": token}).encode())
-        with urllib.request.urlopen(request, timeout=PATIENCE) as reply:
-            self.cookie = reply.headers["Set-Cookie"].partition(";")[0]
-        self.stream = ask(live, "/api/participant/events?page=one", Cookie=self.cookie)
+        key = Client(live.place.link("participant"))._key
+        self.live, self.headers = live, {"Authorization": f"Bearer {key}", "X-Hilbo-Page": "one"}
+        self.stream = ask(live, "/api/participant/events", **self.headers)
 
     def post(self, name):
-        headers = {"Cookie": self.cookie, "Origin": self.origin, "X-Hilbo-Page": "one"}
-        ask(self.live, f"/api/participant/{name}", data=b"{}", **headers).close()
+        ask(self.live, f"/api/participant/{name}", data=b"{}", **self.headers).close()
 
 
 @pytest.mark.deep  # waits 7 s

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from live_server import Live, ask, refused
 
+import hilbo
 from hilbo.app.hub.commands import COMMANDS
 from hilbo.app.hub.hub import PRESSES
 
@@ -58,22 +59,24 @@ def test_what_comes_from_elsewhere_is_refused_with_the_right_key_too(quiet, path
         ask(quiet, path, Authorization=f"Bearer {quiet.participant._key}", **headers)
 
 
-def test_a_cookie_alone_does_not_change_anything(quiet):
-    cookie = f"{quiet.place.gate.cookies['participant']}={quiet.participant._key}"
-    with refused(403):
-        ask(quiet, "/api/participant/begin", data=b"{}", Cookie=cookie)
+def test_no_cookie_is_set_and_none_counts(quiet):
     origin = quiet.participant.address
-    with ask(quiet, "/api/participant", Cookie=cookie, Origin=origin) as reply:
+    for role in ("participant", "experimenter"):
+        key = {"participant": quiet.participant, "experimenter": quiet.experimenter}[role]._key
+        port = origin.rpartition(":")[2]
+        cookie = "; ".join(f"{name}={key}" for name in (f"hilbo_{role}_{port}", f"hilbo.key.{role}", "Authorization"))
+        for path, data in (("", None), ("/events", None), ("/begin" if role == "participant" else "/note", b"{}")):
+            with refused(401):
+                ask(quiet, f"/api/{role}{path}", data=data, Cookie=cookie, Origin=origin)
+    with ask(quiet, "/api/participant", Authorization=f"Bearer {quiet.participant._key}", Origin=origin) as reply:
+        assert reply.headers["Set-Cookie"] is None
         assert "default-src 'none'" in reply.headers["Content-Security-Policy"]
         assert reply.headers["Cache-Control"] == "no-store"
 
 
-def test_a_page_without_a_key_gets_nothing_but_the_way_in(quiet):
-    with pytest.raises(urllib.error.HTTPError) as caught:
-        ask(quiet, "/experimenter")
-    with caught.value as error:
-        assert "join.js" in error.read().decode()
-    assert caught.value.code == 401
+def test_a_page_has_no_content_without_a_key(quiet):
+    with ask(quiet, "/experimenter") as page:
+        assert page.read() == (Path(hilbo.__file__).parent / "app" / "static" / "experimenter.html").read_bytes()
     with refused(401):
         quiet.participant.post("/api/join", {"token": "again"})
 
@@ -118,11 +121,12 @@ def test_a_browser_that_opens_its_used_link_again_finds_its_page_and_nobody_else
     body = json.dumps({"token": quiet.place.link("preparer").partition("#")[2]}).encode()
     page = {"Content-Type": "application/json", "Origin": quiet.participant.address}
     with ask(quiet, "/api/join", data=body, **page) as first:
-        cookie = first.headers["Set-Cookie"].partition(";")[0]
-    with ask(quiet, "/api/join", data=body, **page, Cookie=cookie) as again:
-        assert json.load(again) == {"role": "preparer"} and again.headers["Set-Cookie"] is None
-    wrong = cookie[:-1] + ("_" if cookie.endswith("-") else "-")
-    for other in ({}, {"Cookie": wrong}):
+        joined = json.load(first)
+        assert joined["role"] == "preparer" and first.headers["Set-Cookie"] is None
+    with ask(quiet, "/api/join", data=body, **page, Authorization=f"Bearer {joined['key']}") as again:
+        assert json.load(again) == {"role": "preparer"}
+    wrong = joined["key"][:-1] + ("_" if joined["key"].endswith("-") else "-")
+    for other in ({}, {"Authorization": f"Bearer {wrong}"}, {"Cookie": f"hilbo_preparer={joined['key']}"}):
         with refused(401, "This link has been used"):
             ask(quiet, "/api/join", data=body, **page, **other)
 

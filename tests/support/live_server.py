@@ -229,7 +229,7 @@ def listen(live, heard):
     """Everything that comes as server-sent events, until the server ends; and the page itself."""
     key = {"Authorization": f"Bearer {live.participant._key}"}
     with (
-        ask(live, "/api/participant/events?page=ear", **key) as stream,
+        ask(live, "/api/participant/events", **key) as stream,
         contextlib.suppress(OSError, http.client.HTTPException),
     ):
         for kind in ("html", "js"):

@@ -215,7 +215,7 @@ def _session(program, links, decide, touches, out, say) -> dict[str, Any]:
     experimenter.wait_for_url("**/experimenter")
 
     def watch():
-        return experimenter.evaluate("fetch('/api/experimenter').then(r => r.json())")
+        return experimenter.evaluate("server.ask('/api/experimenter').then(r => r.json())")
 
     window = program.new_context(viewport=desk).new_page()
     mishaps: list[str] = []

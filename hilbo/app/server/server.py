@@ -48,7 +48,6 @@ _ALIVE = 5.0  # s between signs of life in a silent stream
 Served = Any
 """The `Hub` of a session, or the check of a stimulus program in its place."""
 Handler = Callable[[Request], Awaitable[Response]]
-_DAY = 86_400
 _TAKEN = "This link has been used by a program that is still there; end that one first, or ask for a new link."
 _JOIN_TEXTS = ("lang", "wait", "no_link", "used_link", "no_server")
 _HEADERS = {
@@ -73,8 +72,7 @@ class _Guard:
             await self.app(scope, receive, send)
             return
         request = Request(scope)
-        cookie = any(name in request.cookies for name in self.gate.cookies.values()) and not _bearer(request)
-        why = self.gate.refuses(request.headers, changes=request.method not in ("GET", "HEAD"), cookie=cookie)
+        why = self.gate.refuses(request.headers)
 
         async def sending(message):
             if message["type"] == "http.response.start":
@@ -94,7 +92,7 @@ def application(hub: Served, gate: Gate, tried: Tried | None = None) -> Starlett
         Route("/api/join", _either(_join(hub, gate)), methods=["POST"]),
         Route("/api/experimenter/map", guarded("experimenter", _map)),
     ]
-    routes += [Route(f"/{role}", _role_page(hub, gate, role)) for role in PAGES]
+    routes += [Route(f"/{role}", _page(f"{role}.html")) for role in PAGES]  # without content: that needs the key
     for role in ("participant", "experimenter"):
         routes += [Route(f"/api/{role}", guarded(role, _view)), Route(f"/api/{role}/events", guarded(role, _events))]
     routes += [Route("/api/participant/answer", guarded("participant", _answer), methods=["POST"])]
@@ -110,39 +108,23 @@ def application(hub: Served, gate: Gate, tried: Tried | None = None) -> Starlett
     return Starlette(routes=routes, middleware=[Middleware(_Guard, gate=gate)])
 
 
-def _file(name: str) -> Response:
-    return Response(_FILES[name], media_type=mimetypes.guess_type(name)[0])
-
-
 def _page(name: str) -> Handler:
     async def page(_request: Request) -> Response:
-        return _file(name)
+        return Response(_FILES[name], media_type=mimetypes.guess_type(name)[0])
 
     return page
-
-
-def _join_page(hub: Served, status: int = 200) -> Response:
-    """The page that trades a link's token, in the study's language."""
-    page = _FILES["join.html"].decode()
-    for key in _JOIN_TEXTS:
-        page = page.replace(f"{{{key}}}", html.escape(hub.text(key)))
-    return HTMLResponse(page, status)
 
 
 def _way_in(hub: Served) -> Handler:
-    async def page(_request: Request) -> Response:
-        return _join_page(hub)
+    """The page that trades a link's token, in the study's language."""
 
-    return page
+    async def way_in(_request: Request) -> Response:
+        page = _FILES["join.html"].decode()
+        for key in _JOIN_TEXTS:
+            page = page.replace(f"{{{key}}}", html.escape(hub.text(key)))
+        return HTMLResponse(page)
 
-
-def _role_page(hub: Served, gate: Gate, role: Role) -> Handler:
-    async def page(request: Request) -> Response:
-        if not gate.admits(role, request.cookies.get(gate.cookies[role])):
-            return _join_page(hub, 401)
-        return _file(f"{role}.html")
-
-    return page
+    return way_in
 
 
 def _either(handler: Handler) -> Handler:
@@ -179,7 +161,7 @@ def _join(hub: Served, gate: Gate) -> Handler:
         if gate.asked_for(message.token) == "stimulus" and not message.bearer:
             return _error(400, "This link is for a program that presents, not for a browser; give it to the program.")
         used_by = gate.let_in(message.token)
-        if used_by in PAGES and gate.admits(used_by, request.cookies.get(gate.cookies[used_by])):
+        if used_by in PAGES and gate.admits(used_by, _bearer(request)):
             return _json({"role": used_by})  # the same browser opens its link again
         back = used_by == "stimulus" and message.bearer and isinstance(hub.rig, StimulusRig)
         if back and not await hub.rig.free():
@@ -192,11 +174,7 @@ def _join(hub: Served, gate: Gate) -> Handler:
             return _error(401, "This link has been used, or is not of this session; ask for a new one.")
         role, key = granted
         hub.watchers.end(role)
-        if message.bearer:
-            return _json({"role": role, "key": key})
-        reply = _json({"role": role})
-        reply.set_cookie(gate.cookies[role], key, max_age=_DAY, httponly=True, samesite="strict", path="/")
-        return reply
+        return _json({"role": role, "key": key})
 
     return join
 
@@ -206,11 +184,10 @@ def _for(hub: Served, gate: Gate) -> Callable[[Role, Callable], Handler]:
 
     def guarded(role: Role, handler: Callable) -> Handler:
         async def handle(request: Request) -> Response:
-            program = _bearer(request)
-            if not gate.admits(role, program or request.cookies.get(gate.cookies.get(role, ""))):
+            if not gate.admits(role, _bearer(request)):
                 await _body(request)  # the connection ends with the answer, and with it what is still on its way
                 return _error(401, "Open the link of this session first; this page is no longer part of it.")
-            if program and role == "participant":
+            if role == "participant" and _page_of(request) is None:
                 hub.watchers.heard()
             try:
                 return await handler(hub, role, request)
@@ -280,8 +257,7 @@ async def _report(hub: Served, role: Role, request: Request) -> Response:
 
 
 async def _events(hub: Served, role: Role, request: Request) -> Response:
-    page = request.query_params.get("page", "")
-    return StreamingResponse(_stream(hub, role, page[:64]), media_type="text/event-stream")
+    return StreamingResponse(_stream(hub, role, _page_of(request) or ""), media_type="text/event-stream")
 
 
 async def _stream(hub: Served, role: Role, page: str) -> AsyncIterator[bytes]:
@@ -316,14 +292,14 @@ async def _body(request: Request) -> bytes:
 
 
 def _bearer(request: Request) -> str | None:
-    """The key of a program's request; None of a browser's."""
+    """The key of a request."""
     kind, _, key = request.headers.get("authorization", "").partition(" ")
     return key.strip() if kind.lower() == "bearer" and key.strip() else None
 
 
 def _page_of(request: Request) -> str | None:
-    """The id of the browser window that sends a request; None for a program with a key."""
-    return None if _bearer(request) else request.headers.get("x-hilbo-page", "")[:64]
+    """The id of the browser window that sends a request; None for a program."""
+    return request.headers.get("x-hilbo-page", "")[:64] or None
 
 
 def _json(content: Any, status: int = 200) -> Response:

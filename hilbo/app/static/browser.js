@@ -18,7 +18,7 @@ var TOO_OLD = "This browser is too old for this page. Use Chrome or Edge 86, Fir
 function onError(e) { if (e.error instanceof SyntaxError) refusePage(TOO_OLD); }
 window.addEventListener("error", onError);
 document.addEventListener("DOMContentLoaded", function () { window.removeEventListener("error", onError); });
-if (!window.fetch || !window.EventSource || !window.AbortController || !window.crypto || !document.body.replaceChildren) {
+if (!window.fetch || !window.ReadableStream || !window.TextDecoder || !window.AbortController || !window.crypto || !document.body.replaceChildren) {
   refusePage(TOO_OLD);
 }
 try {
@@ -26,7 +26,7 @@ try {
   localStorage.removeItem("hilbo.check");
   sessionStorage.getItem("hilbo.check");
 } catch (error) {
-  refusePage("This browser lets the page store nothing, so that an answer could be lost. Allow cookies and site data for "
+  refusePage("This browser lets the page store nothing, so that an answer could be lost. Allow site data (cookies) for "
     + location.host + ", then load the page again.");
 }
 

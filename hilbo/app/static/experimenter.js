@@ -4,6 +4,7 @@ if (refusal) throw new Error(refusal);
 
 const at = (id) => document.getElementById(id);
 const put = (id, text) => { if (at(id).textContent !== text) at(id).textContent = text; };
+const server = requests(keyOf("experimenter"));
 const SAID = 10000;                  // ms that a refusal stays on the page
 let view = null, mapOf = null, map = null, lastEscape = 0;
 let said = { text: "", until: 0 };   // what this page has to say itself, beside the server's alert
@@ -115,7 +116,7 @@ function drawLog() {
 
 async function loadMap() {
   try {
-    const reply = await fetch("/api/experimenter/map"), found = reply.ok ? await reply.json() : {};
+    const reply = await server.ask("/api/experimenter/map"), found = reply.ok ? await reply.json() : {};
     map = found.slices && found.slices.length ? found : null;
     showMap();
   } catch { mapOf = null; }
@@ -140,9 +141,7 @@ addEventListener("resize", showMap);
 // What the server says to a command; null if it was refused, or nobody answers.
 async function command(name, more = {}) {
   try {
-    const reply = await fetch(`/api/experimenter/${name}`, {
-      method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(more),
-    });
+    const reply = await server.ask(`/api/experimenter/${name}`, more);
     const news = await reply.json();
     say(reply.ok ? "" : news.error);
     return reply.ok ? news : null;
@@ -201,17 +200,15 @@ for (const id of ["invite", "invite-stimulus"]) {
 }
 
 function listen() {
-  const source = new EventSource("/api/experimenter/events");
-  source.onopen = () => say("");
-  source.addEventListener("view", (e) => { view = JSON.parse(e.data); draw(); });
-  source.addEventListener("moved", () => {
-    source.close();
-    say("A newer link of the experimenter has been opened; this page is no longer part of the session.", Infinity);
-    for (const b of document.querySelectorAll("button")) b.disabled = true;
+  const source = server.listen("/api/experimenter/events", {
+    open: () => say(""),
+    view: (next) => { view = next; draw(); },
+    moved: () => {
+      source.close();
+      say("A newer link of the experimenter has been opened; this page is no longer part of the session.", Infinity);
+      for (const b of document.querySelectorAll("button")) b.disabled = true;
+    },
+    lost: (why) => say(why || "The connection to the server is gone; it is being restored.", Infinity),
   });
-  source.onerror = () => {
-    say("The connection to the server is gone; it is being restored.", Infinity);
-    if (source.readyState === EventSource.CLOSED) setTimeout(listen, 1500);
-  };
 }
 listen();

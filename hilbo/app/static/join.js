@@ -1,4 +1,4 @@
-// Trades the one-time token behind the # of the link for the cookie of its role, then goes to that role's page.
+// Trades the one-time token behind the # of the link for the key of its role, then goes to that role's page.
 "use strict";
 (async () => {
   if (refusal) return;
@@ -7,11 +7,8 @@
   history.replaceState(null, "", "/");
   if (!token) { title.textContent = texts.noLink; return; }
   try {
-    const reply = await fetch("/api/join", {
-      method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ token }),
-    });
-    const joined = await reply.json();
-    if (reply.ok) location.replace(`/${joined.role}`);
-    else title.textContent = reply.status === 401 ? texts.usedLink : joined.error;
+    const { status, said } = await join(token);
+    if (status === 200) location.replace(`/${said.role}`);
+    else title.textContent = status === 401 ? texts.usedLink : said.error;
   } catch { title.textContent = texts.noServer; }
 })();

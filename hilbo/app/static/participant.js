@@ -11,16 +11,19 @@ const random = () => Array.from(crypto.getRandomValues(new Uint8Array(12)), (b) 
 const client = localStorage.getItem(CLIENT) || random();
 localStorage.setItem(CLIENT, client);
 const page = random();               // this window; the newest one of a participant is the one that counts
+const server = requests(keyOf("participant"), page);
 
 let view = null;                     // what the server said last
 let answers = {}, asked = 0;         // of the question that is on the page
 let shownAt = 0, stepEnds = 0;       // performance.now()
 let laidOut = 0, goAt = 0;           // when the answers' buttons and Begin came up
+const WITHIN = 15000;                // ms until a request is given up
 const SETTLES = 300;                 // ms: a tap or key that comes sooner was for what stood there before
 let trial = null;                    // id of the trial on the page
 let cued = null;                     // the trial whose question came up while it was still being felt
 let sending = false, connected = false, over = false;
 let source = null, calling = false, silent = false;   // the stream of views; a sign of life under way; none got through
+let refused = "";                    // the server's reason for refusing the stream
 
 function words(name) { return (view && view.texts && view.texts[name]) || ""; }
 function put(id, text) { const e = at(id); if (e.textContent !== text) e.textContent = text; }
@@ -64,7 +67,7 @@ function draw() {
   drawButton("go", !waiting && !over && view.may.begin && !q, words("begin"));
   show("more", !waiting && !over && view.may.more && !q); put("more", words("more"));
   show("break", !waiting && !over && view.may.break); put("break", words("break"));
-  show("line", !connected && !over); put("line", words("disconnected") || "The connection is gone; it is being restored.");
+  show("line", !connected && !over); put("line", refused || words("disconnected") || "The connection is gone; it is being restored.");
 }
 
 function drawSteps() {
@@ -121,10 +124,7 @@ async function hand() {
   sending = true;
   let again = 1000;
   try {
-    const reply = await fetch("/api/participant/answer", {
-      method: "POST", headers: { "Content-Type": "application/json", "X-Hilbo-Page": page }, body,
-      signal: timeout(15000),
-    });
+    const reply = await server.ask("/api/participant/answer", body, WITHIN);
     // Taken, or settled otherwise: a refused one (4xx) is of a trial that is over, and the server has logged that.
     if (reply.ok || (reply.status >= 400 && reply.status < 500 && reply.status !== 429)) {
       if (reply.status === 401 || reply.status === 403) { again = 0; ended(await reply.json()); }
@@ -142,10 +142,7 @@ async function hand() {
 async function press(what) {
   if (!view || over) return;
   try {
-    const reply = await fetch(`/api/participant/${what}`, {
-      method: "POST", headers: { "Content-Type": "application/json", "X-Hilbo-Page": page },
-      body: JSON.stringify({ trial }), signal: timeout(15000),
-    });
+    const reply = await server.ask(`/api/participant/${what}`, { trial }, WITHIN);
     const news = await reply.json().catch(() => null);
     if (news && news.view) receive(news.view);
   } catch { connected = false; draw(); }
@@ -160,14 +157,12 @@ function ended(news) {
 
 function listen() {
   if (source) source.close();
-  source = new EventSource(`/api/participant/events?page=${page}`);
-  source.onopen = () => { connected = true; draw(); hand(); };
-  source.addEventListener("view", (e) => { connected = true; receive(JSON.parse(e.data)); });
-  source.addEventListener("moved", (e) => { source.close(); ended(JSON.parse(e.data)); });
-  source.onerror = () => {
-    connected = false; draw();
-    if (source.readyState === EventSource.CLOSED && !over) setTimeout(listen, 1500);   // refused while it restarts
-  };
+  source = server.listen("/api/participant/events", {
+    open: () => { connected = true; refused = ""; draw(); hand(); },
+    view: (next) => { connected = true; receive(next); },
+    moved: (news) => { source.close(); ended(news); },
+    lost: (why) => { connected = false; refused = why; draw(); },
+  });
 }
 
 // A sign of life every second, since an open stream says nothing of a network that went silently, to either side.
@@ -175,10 +170,7 @@ async function here() {
   if (over || calling) return;
   calling = true;
   try {
-    await fetch("/api/participant/here", {
-      method: "POST", headers: { "Content-Type": "application/json", "X-Hilbo-Page": page }, body: "{}",
-      signal: timeout(2500),
-    });
+    await server.ask("/api/participant/here", {}, 2500);
     if (silent && !over) { silent = false; listen(); }
   } catch { silent = true; connected = false; source.close(); draw(); }
   calling = false;

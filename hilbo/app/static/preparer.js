@@ -8,6 +8,7 @@ if (refusal) throw new Error(refusal);
 const at = (id) => document.getElementById(id);
 const put = (id, text) => { if (at(id).textContent !== text) at(id).textContent = text; };
 const show = (id, yes) => { at(id).hidden = !yes; };
+const server = requests(keyOf("preparer"));
 const SETTLES = 300;                 // ms: a tap that comes sooner was for what stood there before
 
 let run = null, silence = 10, units = {}, tolerances = {}, levels = {};
@@ -17,10 +18,7 @@ let presentedBefore = false;         // something stands there that is to be tak
 let asking = false;                  // what is in the way
 
 async function post(path, content) {
-  const reply = await fetch(path, {
-    method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content),
-    signal: timeout(1000 * silence),
-  });
+  const reply = await server.ask(path, content, 1000 * silence);
   return [reply.status, await reply.json()];
 }
 

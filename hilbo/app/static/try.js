@@ -60,15 +60,13 @@ const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
 const random = () => Array.from(crypto.getRandomValues(new Uint8Array(12)), (b) => b.toString(16).padStart(2, "0")).join("");
 const page = typeof crypto === "undefined" ? "" : random();   // this window's name
 const state = {
-  key: "", facts: null, view: null, order: { order: 0, do: "neutral" }, blocks: null, depths: [0, 0],
+  participant: null, stimulus: null, facts: null, view: null, order: { order: 0, do: "neutral" }, blocks: null, depths: [0, 0],
   held: null, wanted: 0, force: 0, begun: false, sending: false, asked: 0, over: false, then: 0, left: 0,
 };
 
-async function ask(path, body, bearer) {
-  const headers = { "Content-Type": "application/json", "X-Hilbo-Page": page };
-  if (bearer) headers.Authorization = `Bearer ${state.key}`;
-  const what = body === undefined ? {} : { method: "POST", body: JSON.stringify(body) };
-  const reply = await fetch(path, { ...what, headers, signal: timeout(15000) });
+async function ask(path, body) {      // the participant's key for what participants ask, else the stimulus'
+  const server = path.startsWith("/api/participant") ? state.participant : state.stimulus;
+  const reply = await server.ask(path, body, 15000);
   return { status: reply.status, ok: reply.ok, said: await reply.json().catch(() => ({})) };
 }
 
@@ -78,19 +76,20 @@ function end(sentence) {
   put("title", sentence); put("words", ""); at("begin").hidden = true; at("card").hidden = false;
 }
 
-async function join() {
+async function enter() {
   // The link holds the participant's token and the stimulus'; what they are traded for outlives a reload of the page.
   const [participant, stimulus] = location.hash.slice(1).split(".");
   history.replaceState(null, "", "/try");
   if (stimulus) {
     for (const [token, bearer] of [[participant, false], [stimulus, true]]) {
-      const { ok, said } = await ask("/api/join", { token, bearer });
-      if (!ok) return said.error;
+      const { status, said } = await join(token, bearer);
+      if (status !== 200) return said.error;
       if (bearer) sessionStorage.setItem("hilbo.try", said.key);
     }
   }
-  state.key = sessionStorage.getItem("hilbo.try") || "";
-  const { ok, said } = await ask("/api/try", undefined, true);
+  state.participant = requests(localStorage.getItem(`${STORED}participant`) || "", page);
+  state.stimulus = requests(sessionStorage.getItem("hilbo.try") || "");
+  const { ok, said } = await ask("/api/try");
   if (!ok) return "This page needs the link that hilbo try gave; start hilbo try again.";
   state.facts = said;
   return null;
@@ -106,7 +105,7 @@ async function present() {
       const order = state.order, shows = order.do === "present";
       const report = { run, order: order.order, state: shows ? "presented" : "neutral", wait_s: 1 };
       if (shows) Object.assign(report, { trial: order.trial, values: order.values });
-      const reply = await (run ? ask("/api/stimulus", report, true) : ask("/api/stimulus/hello", said, true));
+      const reply = await (run ? ask("/api/stimulus", report) : ask("/api/stimulus/hello", said));
       if (reply.ok) {
         if (reply.said.run) sessionStorage.setItem("hilbo.try.run", had = run = reply.said.run);
         waited = 0; put("hint", HINT); obey(reply.said);
@@ -138,10 +137,9 @@ function obey(order) {
 }
 
 function listen() {
-  const source = new EventSource(`/api/participant/events?page=${page}`);
-  source.addEventListener("view", (e) => receive(JSON.parse(e.data)));
-  source.addEventListener("moved", (e) => { source.close(); end(JSON.parse(e.data).error); });
-  source.onerror = () => { if (source.readyState === EventSource.CLOSED && !state.over) setTimeout(listen, 1500); };
+  const source = state.participant.listen("/api/participant/events", {
+    open: () => {}, view: receive, moved: (news) => { source.close(); end(news.error); }, lost: () => { if (state.over) source.close(); },
+  });
   setInterval(() => { if (!state.over) ask("/api/participant/here", {}).catch(() => {}); }, 1000);
 }
 
@@ -263,7 +261,7 @@ function drawRuler(c, left, size, ink) {
 async function results() {               // the end: one's own map
   let reply = null, heard = performance.now();
   while (!reply || !reply.said.slices) {
-    reply = await ask("/api/try/map", undefined, true).catch(() => null);
+    reply = await ask("/api/try/map").catch(() => null);
     if (reply) heard = performance.now();
     if (performance.now() - heard > 10000) { end("The server has ended before the map was ready; its log holds your answers."); return; }
     await sleep(200);
@@ -287,7 +285,7 @@ async function results() {               // the end: one's own map
 }
 
 async function main() {
-  const wrong = await join().catch(() => "The server does not answer; start hilbo try again.");
+  const wrong = await enter().catch(() => "The server does not answer; start hilbo try again.");
   if (wrong) { end(wrong); return; }
   const stage = at("blocks");
   stage.addEventListener("pointerdown", (e) => { stage.setPointerCapture(e.pointerId); press(e.clientY); });

@@ -30,7 +30,7 @@ class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Join(_Message, frozen=True):
-    """A one-time token for the key of its role; `bearer`: in the answer, for a program, instead of in a cookie."""
+    """A one-time token for the key of its role; `bearer`: a program asks, not a page."""
 
     token: _Id
     bearer: bool = False

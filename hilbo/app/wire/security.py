@@ -1,13 +1,14 @@
 """Who may ask the server for what: one-time links, keys for each role, and where a request may come from.
 
 A link ends in `#token`, which browsers do not send: the page that it opens trades the token, once, for the role's key,
-in a cookie that scripts cannot read (or, for programs, in the answer). Keys outlive the server, in a file beside the
-log that only its owner may read, so that pages find their session again after a restart; tokens that nobody has used
-do not. A used link opens nothing new: its own browser finds its page by it, and a program that presents, once it is
-gone, is taken back by the link that let it in (`Gate.let_in`).
+which pages store and every request carries in Authorization. A browser never sends it by itself, as it would a cookie,
+which goes to all ports of a host. Keys outlive the server, as digests in a file beside the log that only its owner may
+read, so that pages find their session again after a restart; tokens that nobody has used do not. A used link opens
+nothing new: its own browser finds its page by it, and a program that presents, once it is gone, is taken back by the
+link that let it in (`Gate.let_in`).
 
 Host and Origin of every request are compared with the addresses that the server was started for: a page of somebody
-else's that reaches this computer by a name of its own (DNS rebinding) or by a form is refused, whatever cookies it has.
+else's that reaches this computer by a name of its own (DNS rebinding) or by a form is refused, whatever key it has.
 """
 
 import contextlib
@@ -31,28 +32,18 @@ Role = Literal["stimulus", "preparer", "participant", "experimenter"]
 """Who is in a session, the one who is heard first last. The stimulus is a program that presents renderings, the
 preparer a person who does; a session has one of them at most."""
 PAGES: tuple[Role, ...] = ("preparer", "participant", "experimenter")
-"""The roles that have a page in a browser; the other's key is told to a program."""
+"""The roles that have a page in a browser; the other is a program."""
 _BYTES = 24
 _LENGTH = 32  # characters of a key: base64 of _BYTES
-_KEYS = 4  # of each kind that a request may show, so that nobody has the server try thousands
+_KEYS = 4  # that a request may show, so that nobody has the server try thousands
+_SHOWN = re.compile(rf"earer {{1,8}}([\w-]{{{_LENGTH}}})(?![\w-])".encode())
 
 
 class Gate:
-    """Tokens, keys and addresses of one server. `keys` is the file that keeps the keys from one start to the next.
-
-    `cookies` has a name for each role with the port in it: browsers send a host's cookies to all of its ports, so that
-    two sessions on one computer would overwrite each other's.
-    """
+    """Tokens, keys and addresses of one server. `keys` is the file that keeps the keys from one start to the next."""
 
     def __init__(self, hosts: Iterable[str], keys: Path | None = None):
         self.hosts = frozenset(host.lower() for host in hosts)
-        port = min(host.rpartition(":")[2] for host in self.hosts)  # all of them have the same
-        self.cookies: dict[Role, str] = {role: f"hilbo_{role}_{port}" for role in PAGES}
-        roles = "|".join(PAGES)
-        key = rf"([\w-]{{{_LENGTH}}})(?![\w-])"
-        self._shown = [
-            re.compile(f"{before}{key}".encode()) for before in ("earer {1,8}", f"hilbo_(?:{roles})_{port}=")
-        ]
         self.origins = frozenset(f"http://{host}" for host in self.hosts)
         self._tokens: dict[str, Role] = {}
         self.keep_in(keys)
@@ -105,12 +96,11 @@ class Gate:
     def role_in(self, data: bytes) -> Role | None:
         """The role whose key is in some bytes of a connection, before anything has read them as HTTP; of two the
         experimenter's."""
-        shown = (itertools.islice(pattern.finditer(data), _KEYS) for pattern in self._shown)
-        keys = [match[1].decode() for match in itertools.chain.from_iterable(shown)]
+        keys = [match[1].decode() for match in itertools.islice(_SHOWN.finditer(data), _KEYS)]
         return next((role for role in reversed(get_args(Role)) for key in keys if self.admits(role, key)), None)
 
-    def refuses(self, headers: Mapping[str, str], *, changes: bool, cookie: bool) -> str | None:
-        """Why a request of these headers is refused, or None. `changes`: it is no mere look; `cookie`: its key was."""
+    def refuses(self, headers: Mapping[str, str]) -> str | None:
+        """Why a request with these headers is refused, or None."""
         if headers.get("host", "").lower() not in self.hosts:
             return "This address is not the one that the session was started for; use the link that it gave."
         origin = headers.get("origin")
@@ -118,8 +108,6 @@ class Gate:
             return "The request comes from a page of another site."
         if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
             return "The request comes from a page of another site."
-        if changes and cookie and origin is None:
-            return "The request does not say which page it comes from; a program sends its key in Authorization."
         return None
 
     def _keep(self, digests: Mapping[str, Mapping[Role, str]]) -> None:
