@@ -214,9 +214,9 @@ class Renderer:
                     raise
             self._link.pause(_NEAR)
 
-    def stop(self) -> None:
-        """Ramp the force to zero."""
-        self._link.request(protocol.Stop())
+    def stop(self) -> int:
+        """Ramp the force to zero, and return the device's count of stops, this one included."""
+        return self._link.request(protocol.Stop()).stops
 
     def estop(self) -> None:
         """Emergency stop: force to zero at once, latched until `clear`."""

@@ -142,6 +142,38 @@ def test_a_clear_after_the_rig_s_own_stop_is_carried_out():
         asyncio.run(held(rig))
 
 
+@pytest.mark.parametrize("counted", [False, True])
+@pytest.mark.parametrize("other", [False, True])
+def test_a_clear_while_the_rig_s_own_stop_is_under_way(counted, other):
+    """It is carried out, whether the device has counted the STOP or not; and not after another's stop, whenever that is."""
+    under_way, go_on = threading.Event(), threading.Event()
+
+    class Slow(FakeDevice):
+        def stop(self):
+            count = super().stop() if counted else None
+            under_way.set()
+            assert go_on.wait(10)
+            return count or super().stop()
+
+    async def held(rig):
+        rested = asyncio.ensure_future(rig.rest())
+        await until(under_way.is_set)
+        cleared = asyncio.ensure_future(rig.clear())
+        await asyncio.sleep(0)
+        if other:
+            device.stopped_by(HoldReason.VELOCITY, State.HOLD)
+        go_on.set()
+        await rested
+        with pytest.raises(DeviceError, match="STALE") if other else contextlib.nullcontext():
+            await cleared
+        assert device.now == (State.HOLD if other else State.STOPPED)
+
+    device = Slow()
+    device.stopped_by(HoldReason.VELOCITY, State.HOLD)
+    with rig_of(device) as rig:
+        asyncio.run(held(rig))
+
+
 def test_a_clear_that_comes_late_is_refused_in_a_sentence():
     device = FakeDevice()
 

@@ -65,6 +65,7 @@ class FakeDevice(Renderer):
         if self.now == State.RUNNING:
             self.now = State.STOPPED
         self.told.append("stop")
+        return self.link.stops
 
     def estop(self):
         self.stopped_by(HoldReason.ESTOP)

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import functools
 import http.client
+import io
 import threading
 import time
 import urllib.error
@@ -198,8 +199,14 @@ class Live:
         return self.participant.post("/api/participant/answer", self.message(view or self.question(), **changes))
 
     def command(self, name, **content):
-        """An experimenter's command."""
-        return self.experimenter.post(f"/api/experimenter/{name}", content)
+        """An experimenter's command; a refusal's sentence stands in the traceback."""
+        try:
+            return self.experimenter.post(f"/api/experimenter/{name}", content)
+        except urllib.error.HTTPError as error:
+            sentence = error.read()
+            error.add_note(sentence.decode())
+            error.fp = io.BytesIO(sentence)
+            raise
 
     def events(self, kind=None):
         """What is in the log, on the disk."""

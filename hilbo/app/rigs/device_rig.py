@@ -49,7 +49,7 @@ class DeviceRig:
         self._study, self._connect, self._changed, self._notice = study, connect, changed, notice
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future] | None] = queue.SimpleQueue()
         self._ending = threading.Event()
-        self._own_stops, self._stopping = 0, 0  # STOPs of this rig that were acknowledged; 1 while one is on its way
+        self._own_stops: list[int] = []  # the device's count of stops at each acknowledged STOP of this rig
         self.device = connect()
         self._counter = SampleCounter(lambda: self.device.samples(0).flags)  # what has arrived, without waiting
         self.simulated = bool(self.device.can & Capability.SIMULATED)
@@ -107,21 +107,22 @@ class DeviceRig:
     async def clear(self) -> None:
         """Go on after the hold or stop that was known when this was called, and after no later one.
 
-        A STOP of this rig that was requested before, and reaches the device in between, is no later one: each that is
-        acknowledged counts one. `stops` is read first, and one that is on its way now is not counted: then the order
-        may be refused, and never names a stop that is to come.
+        A STOP of this rig that was requested before, and acknowledged meanwhile, is no later one, unless the device
+        counted another stop before it.
         """
+        acknowledged = len(self._own_stops)  # read before `stops`: a STOP that `stops` includes changes nothing below
         stop = self.device.link.stops
-        own = self._own_stops + self._stopping
-        await asyncio.wrap_future(self.do(lambda device: device.clear(stop=stop + self._own_stops - own)))
+
+        def clear(device: Renderer) -> None:
+            known = stop
+            for count in self._own_stops[acknowledged:]:
+                known = count if count == known + 1 else known
+            device.clear(stop=known)
+
+        await asyncio.wrap_future(self.do(clear))
 
     def _stop(self, device: Renderer) -> None:
-        self._stopping = 1
-        try:
-            device.stop()
-            self._own_stops += 1
-        finally:
-            self._stopping = 0
+        self._own_stops.append(device.stop())
 
     def hang_up(self) -> None:
         """Do nothing: no client waits for a device."""
