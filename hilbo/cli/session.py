@@ -3,7 +3,6 @@
 What they write is whole or absent, and nothing is replaced without `--force`.
 """
 
-import json
 import shutil
 from pathlib import Path
 from typing import Annotated, Any
@@ -94,7 +93,8 @@ def export(
     from hilbo.session.export import tables as log_tables
     from hilbo.session.export.netcdf import netcdf
     from hilbo.session.export.psych_ds import psych_ds
-    from hilbo.session.plan.plan import check_plan, read_plan
+    from hilbo.session.plan.plan import check_plan
+    from hilbo.study.file.plan_file import read_plan
     from hilbo.study.file.reading import StudyFile
 
     chosen = StudyFile.load(study)
@@ -160,7 +160,7 @@ def _say_done(done) -> None:
         typer.echo(f"make again: {command}", err=True)
 
 
-def _plan_of(path, kind, source, people, materials, paths, trials, session, seed) -> dict[str, Any]:
+def _plan_of(path, kind, source, people, materials, paths, trials, session, seed) -> Any:
     """The plan; `paths`: material -> result.json, of which the sets of a validation are made."""
     start()
     from hilbo.session.plan.plan import make_plan
@@ -258,19 +258,19 @@ def _by_material(materials, given) -> dict[str, Path]:
 
 
 def _reissued(path, study_path, study, text, results_):
-    from hilbo.session.plan.plan import check_plan, read_plan, reissue
+    from hilbo.session.plan.plan import check_plan, reissue
+    from hilbo.study.file.plan_file import read_plan
 
     old, equals, new = text.partition("=")
     if not equals:
         raise InputError(f'--reissue is "{text}"; write OLD=NEW.')
-    try:
-        plan = read_plan(path)
-    except InputError as error:
-        raise InputError(f"{path}: is no plan that can be read; give the one to change with --out.") from error
+    if not path.exists():
+        raise InputError(f"{path}: is not there; give the plan to change with --out.")
+    plan = read_plan(path)
     check_plan(plan, study)
     changed = reissue(plan, old.strip(), new.strip())
-    if plan.get("phase") == "validation" and plan["source"] == "aggregate":
-        materials = tuple(name for name in plan["materials"] if name is not None)
+    if plan.phase == "validation" and plan.source == "aggregate":
+        materials = tuple(name for name in plan.materials if name is not None)
         _check_not_in_map(path, study_path, materials, results_, new.strip())
     return changed
 
@@ -310,9 +310,11 @@ def _write_registration(file, plan, out, force):
 
 
 def _write_plan(plan, out, force, as_json):
-    text = json.dumps(plan, indent=1, ensure_ascii=False) + "\n"
+    from hilbo.study.file.plan_file import plan_text
+
+    text = plan_text(plan)
     write_new(out, text, force)
-    complete = "complete blocks" if plan["complete"] else f"incomplete: balance is exact at {plan['complete_at']}"
-    typer.echo(f"{out}: {len(plan['participants'])} participants, {complete}, hash {plan['hash']}", err=True)
+    complete = "complete blocks" if plan.complete else f"incomplete: balance is exact at {plan.complete_at}"
+    typer.echo(f"{out}: {len(plan.participants)} participants, {complete}, hash {plan.hash}", err=True)
     if as_json:
         typer.echo(text, nl=False)

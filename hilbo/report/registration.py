@@ -4,10 +4,11 @@ The page is Markdown, which registries take as it is. What no file says (why so 
 there as a line to fill in, so that nobody takes its silence for a decision.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from hilbo.population.rules.registry import RULES
+from hilbo.study.file.plan_file import Plan
 from hilbo.study.file.protocols import Phase, protocol
 from hilbo.study.file.reading import StudyFile
 
@@ -23,9 +24,9 @@ _ACQUISITIONS = {
 }
 
 
-def registration(study: StudyFile, plan: Mapping[str, Any], version: str) -> str:
+def registration(study: StudyFile, plan: Plan, version: str) -> str:
     """The page, in Markdown. `plan`: of this study, as `make_plan` gives it; `version`: hilbo's."""
-    phase: Phase = plan["phase"]
+    phase: Phase = plan.phase
     parts = [
         (f"{study.name}: what is fixed before the first answer", _identity(study, plan, version)),
         ("Question and expectation", [f"{_OPEN} What is asked, and what is expected."]),
@@ -40,25 +41,25 @@ def registration(study: StudyFile, plan: Mapping[str, Any], version: str) -> str
     return "\n\n".join(sections) + "\n"
 
 
-def _identity(study: StudyFile, plan: Mapping[str, Any], version: str) -> list[str]:
+def _identity(study: StudyFile, plan: Plan, version: str) -> list[str]:
     return [
-        f"* Sessions: {plan['phase']}",
+        f"* Sessions: {plan.phase}",
         f"* Study file: {study.source.rsplit('/', 1)[-1]}, hash {study.hash}",
-        f"* Plan: hash {plan['hash']}, random seed {plan['seed']}; both hashes stand in every session's log",
+        f"* Plan: hash {plan.hash}, random seed {plan.seed}; both hashes stand in every session's log",
         f"* Software: hilbo {version}",
     ]
 
 
-def _participants(plan: Mapping[str, Any]) -> list[str]:
-    people = [row["participant"] for row in plan["participants"]]
+def _participants(plan: Plan) -> list[str]:
+    people = [row.participant for row in plan.participants]
     lines = [
         f"* {len(people)}, {people[0]} to {people[-1]}. {_OPEN} Why so many (`hilbo power`), and who may take part.",
         f"* Data collection ends with the last of them. {_OPEN} Whether results are looked at before, and what for.",
         "* Who drops out may be replaced; the new participant has the same row of the plan (`hilbo plan --reissue`).",
     ]
-    if len(plan["materials"]) > 1:
-        balance = "complete" if plan["complete"] else f"exact at {plan['complete_at']}"
-        lines.append(f"* Materials {_list(plan['materials'])}, in counterbalanced order ({balance}).")
+    if len(plan.materials) > 1:
+        balance = "complete" if plan.complete else f"exact at {plan.complete_at}"
+        lines.append(f"* Materials {_list(plan.materials)}, in counterbalanced order ({balance}).")
     return lines
 
 

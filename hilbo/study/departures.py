@@ -2,12 +2,9 @@
 plan each session was held."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
-import msgspec
-
-from hilbo.study.formats.json_file import decoded, read_bytes
+from hilbo.study.file.plan_file import Plan
 
 __all__ = ["PHASE", "Held", "departures"]
 
@@ -24,39 +21,21 @@ class Held(NamedTuple):
     """Its hash; empty where it was held by none."""
 
 
-class _Row(msgspec.Struct):
-    """A planned session."""
-
-    participant: str
-
-
-class _Plan(msgspec.Struct):
-    """What is read of a plan."""
-
-    study: str
-    hash: str
-    phase: str
-    participants: Annotated[tuple[_Row, ...], msgspec.Meta(min_length=1)]
-    replaces: tuple[str, ...] = ()
-    """Its hashes before somebody withdrew, or a row was reissued: a session that was held by one was held by it."""
-
-
 def departures(
-    path: Path,
+    plan: Plan,
     study_hash: str,
     trials: int,
     counts: Mapping[str, Sequence[int]],
     sessions: Sequence[Held] | None = None,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What departs from the plan in a file, in sentences; and what is as planned, if nothing does.
+    """What departs from the plan, in sentences; and what is as planned, if nothing does.
 
     **Arguments:** `study_hash`: of the study file of these answers; `trials`: that each person was to answer for each
     material; `counts`: person -> number of answers for each material; `sessions`: those of this phase, None where
-    nothing says by which plan they were held. Raises InputError for a file that is no plan.
+    nothing says by which plan they were held.
     """
-    plan = decoded(read_bytes(path), _Plan, str(path), "is no plan; make one with hilbo plan")
     if plan.phase != PHASE:
-        return (f"{path.name} is a plan of {plan.phase}, so that these answers are compared with no plan.",), ()
+        return (f"plan.json is a plan of {plan.phase}, so that these answers are compared with no plan.",), ()
     planned = [row.participant for row in plan.participants]
     sentences = []
     if plan.study != study_hash:
@@ -86,7 +65,7 @@ def departures(
     return tuple(f"Departs from the plan {plan.hash}. {sentence}" for sentence in sentences), ()
 
 
-def _held_otherwise(plan: _Plan, sessions: Sequence[Held]) -> list[str]:
+def _held_otherwise(plan: Plan, sessions: Sequence[Held]) -> list[str]:
     """Sentences on the sessions that were held by no plan, or by another."""
     own = (plan.hash, *plan.replaces)
     none = [f"{held.participant} (session {held.session})" for held in sessions if not held.plan]

@@ -25,6 +25,7 @@ from hilbo.errors import InputError, warn_caller
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.departures import PHASE, Held, departures
+from hilbo.study.file.plan_file import read_plan
 from hilbo.study.file.trial_flags import FlagCounts, flag_sentences
 from hilbo.study.formats.csv_file import cell_pieces, numbers, parameter_values, read_cells
 from hilbo.study.tables.flag_counts import flag_counts
@@ -267,7 +268,7 @@ def _departures(folder: Path, study: Study, materials: list[Material]) -> tuple[
         answers = Counter(dict(zip(material.cohort.names, material.cohort.counts().tolist(), strict=True)))
         for name, count in (answers + Counter(material.flags.excluded)).items():
             counts.setdefault(name, []).append(count)
-    return departures(path, study.file.hash, study.file.selection.trials, counts, _held(folder))
+    return departures(read_plan(path), study.file.hash, study.file.selection.trials, counts, _held(folder))
 
 
 def _held(folder: Path) -> list[Held] | None:

@@ -12,8 +12,8 @@ from hilbo.app.pages.slices import Maps
 from hilbo.app.rehearsal import rehearsal
 from hilbo.app.rehearsal.robot import Client, Participant, browser, find_browser, held
 from hilbo.session.log.event_log import EventLog, read_log
-from hilbo.session.log.records import Block, Planned
 from hilbo.study.config import Study
+from hilbo.study.file.plan_file import Block, Planned
 from hilbo.study.template import NewStudy, parameter_of, study_text
 
 pytestmark = [

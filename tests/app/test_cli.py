@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 from commands import run
 from live_server import DATA, study_of
-from msgspec import structs, to_builtins
+from msgspec import structs
 
 from hilbo.app.hub.opening import Wanted, opened
 from hilbo.app.rehearsal.rehearsal import example_sets, fast_study, rehearse
@@ -27,10 +27,11 @@ from hilbo.session.log import actions
 from hilbo.session.log.event_log import read_log
 from hilbo.session.log.header import header_for
 from hilbo.session.plan.participants import add_person
-from hilbo.session.plan.plan import make_plan, plan_hash, reissue
+from hilbo.session.plan.plan import make_plan, planned_part, reissue
 from hilbo.session.withdrawal.withdrawal import delete_participant
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
+from hilbo.study.file.plan_file import hashed, plan_text, read_plan
 from hilbo.study.file.protocols import protocol
 from hilbo.study.template import NewStudy, parameter_of, study_text
 
@@ -141,7 +142,7 @@ def test_each_session_of_a_person_has_keys_of_its_own(tmp_path, monkeypatch):
     study = study_of(tmp_path)
     plans = {label: tmp_path / f"plan {label}.json" for label in ("1", "2")}
     for label, path in plans.items():
-        path.write_text(json.dumps(make_plan(study.file, ["P01"], session=label)))
+        path.write_text(plan_text(make_plan(study.file, ["P01"], session=label)))
     file, logs = tmp_path / "study.toml", tmp_path / "logs"
     place = (file, "--logs", logs, "--port", 0, "--dry-run", "--participant")
     first = served(monkeypatch, *place, "P01", "--plan", plans["1"])
@@ -187,12 +188,9 @@ def test_a_warm_start_is_in_the_log_and_a_resumed_session_chooses_the_same(tmp_p
     study = study_of(tmp_path)
     file, logs = a_map(study, tmp_path / "map.nc"), tmp_path / "logs"
     header = header_for(study.file, "P01", seed=7, warm=False)
-    plan = {
-        "schema": 1,
-        "study": study.file.hash,
-        "participants": [{"participant": "P01", "header": to_builtins(header)}],
-    }
-    (tmp_path / "plan.json").write_text(json.dumps(plan | {"hash": plan_hash(plan)}))
+    plan = make_plan(study.file, ["P01"])
+    row = structs.replace(plan.participants[0], header=planned_part(header))
+    (tmp_path / "plan.json").write_text(plan_text(hashed(structs.replace(plan, participants=(row,)))))
     wanted = Wanted(
         tmp_path / "study.toml", "P01", logs=logs, plan=tmp_path / "plan.json", warm_start=file, dry_run=True
     )
@@ -218,7 +216,7 @@ def test_a_warm_start_that_is_refused_leaves_no_log(tmp_path):
     plan = make_plan(
         study.file, ["P01"], 0, "validation", sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
     )
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    (tmp_path / "plan.json").write_text(plan_text(plan))
     planned = wanted._replace(plan=tmp_path / "plan.json", warm_start=a_map(study, tmp_path / "map.nc"))
     with pytest.raises(InputError, match="nothing is chosen"):
         opened(planned, lambda *_: None, lambda _: None)
@@ -285,8 +283,8 @@ def test_options_that_contradict_the_plan_are_refused_and_another_label_begins_i
     file, path = tmp_path / "study.toml", tmp_path / "plan.json"
     file.write_text(file.read_text() + "\n[materials.foam]\n[materials.gel]\n")
     plan = make_plan(Study.load(file).file, ["P01"], 5, materials=["gel"], session="gel")
-    path.write_text(json.dumps(plan))
-    seed = plan["participants"][0]["header"]["seed"]
+    path.write_text(plan_text(plan))
+    seed = plan.participants[0].header.seed
     wanted = Wanted(file, "P01", logs=tmp_path / "logs", plan=path, dry_run=True)
     wanted.logs.mkdir()
     for change, words in (
@@ -310,21 +308,20 @@ def test_a_session_is_resumed_by_a_plan_that_replaces_its_own(tmp_path):
     study = study_of(tmp_path)
     file, path, logs = tmp_path / "study.toml", tmp_path / "plan.json", tmp_path / "logs"
     plan = make_plan(study.file, ["P01", "P02", "P03"])
-    path.write_text(json.dumps(plan))
+    path.write_text(plan_text(plan))
     wanted = Wanted(file, "P01", logs=logs, plan=path, dry_run=True)
     logs.mkdir()
     opened(wanted, lambda *_: None, lambda *_: None)[1].close()
-    path.write_text(json.dumps(reissue(plan, "P02", "P04")))
+    path.write_text(plan_text(reissue(plan, "P02", "P04")))
     opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)[1].close()
     delete_participant(tmp_path, "P03")
     opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)[1].close()
-    changed = json.loads(path.read_text())
-    assert len(changed["replaces"]) == 2
+    assert len(read_plan(path).replaces) == 2
     for other in (
         make_plan(study.file, ["P01"]),
-        make_plan(study.file, ["P01"], 1) | {"replaces": [plan["hash"]]},  # what was begun is not in it
+        structs.replace(make_plan(study.file, ["P01"], 1), replaces=(plan.hash,)),  # what was begun is not in it
     ):
-        path.write_text(json.dumps(other | {"hash": plan_hash(other)}))
+        path.write_text(plan_text(hashed(other)))
         with pytest.raises(InputError, match="was begun by another plan"):
             opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)
 

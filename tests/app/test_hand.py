@@ -8,7 +8,7 @@ from live_server import Live
 from hilbo.app.hub import runner
 from hilbo.device.reasons import HoldReason, SampleFlag, State
 from hilbo.session.export.tables import trials_table
-from hilbo.session.log.records import Block, Planned
+from hilbo.study.file.plan_file import Block, Planned
 
 WARM_UP = (Block("warm-up", 4, tuple(map(Planned, ("best", "mid", "worst", "best")))),)
 

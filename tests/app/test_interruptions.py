@@ -12,7 +12,7 @@ from live_server import Live, ask, refused
 
 from hilbo.app.rehearsal.robot import Client
 from hilbo.app.wire import security, watchers
-from hilbo.session.log.records import Block, Planned
+from hilbo.study.file.plan_file import Block, Planned
 
 
 @pytest.fixture

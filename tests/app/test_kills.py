@@ -4,7 +4,6 @@
 """
 
 import contextlib
-import json
 import os
 import sys
 import time
@@ -18,6 +17,7 @@ from hilbo.device.local.simulator import Simulator
 from hilbo.session.plan.plan import make_plan
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
+from hilbo.study.file.plan_file import plan_text
 
 KILLS = int(os.environ.get("HILBO_KILLS", "8"))
 pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals and SIGKILL")]
@@ -81,7 +81,7 @@ def test_killed_servers_lose_and_double_nothing(tmp_path, phase, share):
         plan = make_plan(
             study.file, ["P01"], 0, phase, sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
         )
-        (tmp_path / "plan.json").write_text(json.dumps(plan))
+        (tmp_path / "plan.json").write_text(plan_text(plan))
         arguments += ["--plan", str(tmp_path / "plan.json")]
     logs = [finished(study.file, tmp_path / name, arguments, n, 0.8) for name, n in (("killed", kills), ("whole", 0))]
     assert essence(logs[0]) == essence(logs[1])
@@ -93,7 +93,7 @@ def test_a_kill_while_a_device_of_its_own_renders_loses_not_even_the_click(tmp_p
     plan = make_plan(
         study.file, ["P01"], 0, "validation", sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
     )
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    (tmp_path / "plan.json").write_text(plan_text(plan))
     with contextlib.ExitStack() as ended:
         device = ended.enter_context(contextlib.closing(Simulator(finger="none")))
         arguments = [str(file), "--participant", "P01", "--plan", str(tmp_path / "plan.json"), "--device", device.port]

@@ -14,7 +14,7 @@ from hilbo.app.server import server
 from hilbo.app.wire import messages
 from hilbo.app.wire.lines import fields_of, lines_of
 from hilbo.errors import InputError
-from hilbo.session.log.records import Block, Planned
+from hilbo.study.file.plan_file import Block, Planned
 
 
 def test_a_form_is_read_as_text():

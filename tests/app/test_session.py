@@ -10,7 +10,7 @@ from live_server import PATIENCE, Live, check_blinding, listen, refused
 from hilbo.app.hub.opening import Wanted, opened
 from hilbo.app.pages.views import choice_rows
 from hilbo.session.export.tables import validation_table
-from hilbo.session.log.records import Block, Planned
+from hilbo.study.file.plan_file import Block, Planned
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from hilbo.app.rehearsal.robot import Client
 from hilbo.cli import doctor
 from hilbo.errors import InputError
 from hilbo.session.export.tables import trials_table
-from hilbo.session.log.records import Block, Planned
+from hilbo.study.file.plan_file import Block, Planned
 from hilbo.study.template import NewStudy, parameter_of, study_text
 
 ONE = (Block("warm-up", 1, (Planned("best"),)),)

@@ -18,8 +18,8 @@ from live_server import PATIENCE, check_blinding, listen
 from live_stimulus import SETS, ByHand, LiveStimulus
 
 from hilbo.session.log.event_log import read_log
-from hilbo.session.log.records import Block, Planned
 from hilbo.session.log.state import LiveSession
+from hilbo.study.file.plan_file import Block, Planned
 
 MANY = int(os.environ.get("HILBO_FUZZ", "500"))
 REFUSALS = {400, 401, 403, 404, 405, 409, 413}

@@ -14,8 +14,8 @@ from hilbo.app.wire.lines import lines_of
 from hilbo.session.export.netcdf import netcdf
 from hilbo.session.export.psych_ds import psych_ds
 from hilbo.session.export.tables import sets_table, trials_table
-from hilbo.session.log.records import Block
 from hilbo.study.cohort import cohort_of
+from hilbo.study.file.plan_file import Block
 
 LEVELS = ("silk", "wood", "smooth stone")
 

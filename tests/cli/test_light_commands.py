@@ -11,6 +11,7 @@ from simulated import ENVIRONMENT, ROOT, needs_device
 from hilbo.session.log.event_log import EventLog
 from hilbo.session.log.log_files import log_name
 from hilbo.session.plan.plan import make_plan
+from hilbo.study.file.plan_file import plan_text
 from hilbo.study.file.reading import StudyFile
 
 PAPER = str(ROOT / "hilbo" / "data" / "paper.toml")
@@ -79,7 +80,7 @@ def folder(tmp_path):
     """A study, a plan, and the log of one session."""
     (tmp_path / "study.toml").write_text(PLAIN)
     plan = make_plan(StudyFile.load(tmp_path / "study.toml"), ["P01", "P02"])
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    (tmp_path / "plan.json").write_text(plan_text(plan))
     driver = Driver()
     driver.finish()
     with EventLog.create(tmp_path / "logs" / log_name(driver.header), driver.state.study, driver.header) as log:

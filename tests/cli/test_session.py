@@ -14,8 +14,8 @@ from hilbo.cli import doctor, main
 from hilbo.errors import InputError
 from hilbo.session.log.event_log import EventLog
 from hilbo.session.log.log_files import log_name
-from hilbo.session.log.records import Block
 from hilbo.session.plan.plan import make_plan, planned_header
+from hilbo.study.file.plan_file import Block, plan_text, read_plan
 from hilbo.study.folder import read_folder
 from hilbo.study.tables.validation import read_validation, sets_frame
 
@@ -62,12 +62,14 @@ def test_a_plan_is_written_once_and_can_be_reissued(hilbo, tmp_path):
     plan = json.loads(out)
     assert code == 0 and "complete blocks" in err and plan == json.loads((tmp_path / "plan.json").read_text())
     assert [row["participant"] for row in plan["participants"]] == ["P01", "P02", "P03"]
-    assert planned_header(plan, study.file, "P02").seed == plan["participants"][1]["header"]["seed"]
+    before = read_plan("plan.json")
+    assert planned_header(before, study.file, "P02").seed == plan["participants"][1]["header"]["seed"]
     code, _, err = hilbo("plan", "study.toml", "--participants", 3)
     assert code == 2 and "plan.json: exists already" in err
     assert hilbo("plan", "study.toml", "--reissue", "P02=P09")[0] == 0
     changed = json.loads((tmp_path / "plan.json").read_text())
-    assert planned_header(changed, study.file, "P09").seed == planned_header(plan, study.file, "P02").seed
+    after = read_plan("plan.json")
+    assert planned_header(after, study.file, "P09").seed == planned_header(before, study.file, "P02").seed
     for again, sentence in (
         ("P01", "write OLD=NEW"),
         ("P01=", 'participant is ""'),
@@ -92,7 +94,7 @@ def test_a_plan_is_written_once_and_can_be_reissued(hilbo, tmp_path):
         (("--names", "P1", "--session", "x" * 65), "it must have 1 to 64 characters"),
         (("--names", "P1", "--session", "a\nb"), 'the session\'s label is "a?b"; it must have'),
         (("--names", "P1", "--material", "foam"), "materials.foam is not in the study"),
-        (("--reissue", "P1=P2"), "is no plan that can be read"),
+        (("--reissue", "P1=P2"), "plan.json: is not there; give the plan to change with --out"),
         (("--reissue", "P1"), '--reissue is "P1"; write OLD=NEW'),
         (("--names", "P01,P02,"), 'participant is ""; an id has'),
         (("--names", "P 1"), 'participant is "P 1"; an id has'),
@@ -135,7 +137,7 @@ def test_nobody_is_given_a_row_to_validate_a_map_that_they_are_in(hilbo, tmp_pat
     study = Study.load("study.toml")
     sets = {name: {"u": u, "v": 0.5} for name, u in (("best", 0.1), ("mid", 0.5), ("worst", 0.9))}
     plan = make_plan(study.file, ["V01", "V02"], 0, "validation", sets={"": sets}, source="aggregate")
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    (tmp_path / "plan.json").write_text(plan_text(plan))
     (tmp_path / "result.json").write_text(json.dumps(a_result(study)))
     before = (tmp_path / "plan.json").read_bytes()
     for arguments, sentence in (
@@ -146,7 +148,7 @@ def test_nobody_is_given_a_row_to_validate_a_map_that_they_are_in(hilbo, tmp_pat
         code, _, err = hilbo("plan", "study.toml", "--reissue", *arguments)
         assert code == 2 and sentence in err and (tmp_path / "plan.json").read_bytes() == before
     assert hilbo("plan", "study.toml", "--reissue", "V02=V03", "--from", "result.json")[0] == 0
-    assert planned_header(json.loads((tmp_path / "plan.json").read_text()), study.file, "V03").participant == "V03"
+    assert planned_header(read_plan("plan.json"), study.file, "V03").participant == "V03"
 
 
 def test_a_validation_of_two_materials_looks_for_somebody_new_in_both_maps(hilbo, tmp_path):
@@ -156,7 +158,7 @@ def test_a_validation_of_two_materials_looks_for_somebody_new_in_both_maps(hilbo
     sets = {name: {"u": u, "v": 0.5} for name, u in (("best", 0.1), ("mid", 0.5), ("worst", 0.9))}
     both = dict.fromkeys(("foam", "gel"), sets)
     plan = make_plan(study.file, ["V01", "V02"], 0, "validation", sets=both, source="aggregate")
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    (tmp_path / "plan.json").write_text(plan_text(plan))
     people = {"foam": ["P01"], "gel": ["P02"]}
     for name, ids in people.items():
         result = a_result(study.material(name), participants=[{"participant": one} for one in ids])

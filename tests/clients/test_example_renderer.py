@@ -14,7 +14,7 @@ from live_stimulus import CLIENTS, LiveStimulus, all_answered
 from simulated import ENVIRONMENT, needs_device, own_cache  # noqa: F401
 
 from hilbo.device.local.motor import SimulatedMotor
-from hilbo.session.log.records import Block, Planned
+from hilbo.study.file.plan_file import Block, Planned
 
 pytestmark = [pytest.mark.deep, needs_device]
 RENDERED = {

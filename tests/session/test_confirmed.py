@@ -17,8 +17,9 @@ from hilbo.session.export.tables import sets_table, trials_table, validation_tab
 from hilbo.session.log import actions as live
 from hilbo.session.log.header_check import check_new_header
 from hilbo.session.log.presented import check_confirmed, counted
-from hilbo.session.log.records import Block, Planned, RefusedError
+from hilbo.session.log.records import RefusedError
 from hilbo.session.log.state import LiveSession
+from hilbo.study.file.plan_file import Block, Planned
 
 STUDY = Study.from_dict(RAW | {"stimulus": {"tolerance": {"u": 0.01}, "within": 2.0}})
 ASKED = SETS["A"]

@@ -12,8 +12,8 @@ from hilbo.app.pages.slices import Maps
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.log import actions as live
-from hilbo.session.log.records import Block
 from hilbo.session.log.state import LiveSession
+from hilbo.study.file.plan_file import Block
 
 pytestmark = pytest.mark.empties_caches
 

@@ -22,8 +22,8 @@ from hilbo.session.log import actions as live
 from hilbo.session.log.event_log import EventLog, read_log
 from hilbo.session.log.header import header_for
 from hilbo.session.log.log_files import log_name
-from hilbo.session.log.records import Block
 from hilbo.session.log.state import LiveSession
+from hilbo.study.file.plan_file import Block
 
 ANSWERS = ("similar", "different", "close", "close", "similar", "close")
 

@@ -1,5 +1,6 @@
 """Plans: whole studies in advance, the same from the same seed, refused when changed or of another study."""
 
+import hashlib
 import json
 from collections import Counter
 
@@ -15,11 +16,11 @@ from hilbo.errors import InputError
 from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.log import actions as live
 from hilbo.session.log.header import header_for, material_seed, warm_up
-from hilbo.session.log.records import Block
 from hilbo.session.log.state import LiveSession
-from hilbo.session.plan.plan import make_plan, plan_hash, planned_header, reissue
+from hilbo.session.plan.plan import make_plan, planned_header, reissue
 from hilbo.session.plan.validation_sets import aggregate_best_sets, check_participants, validation_sets
 from hilbo.study.cohort import cohort_of
+from hilbo.study.file.plan_file import Block, plan_text, read_plan
 from hilbo.study.file.protocols import protocol
 from hilbo.study.results.result_json import FoundOptimum, FoundPerson, Result, read_result
 
@@ -28,30 +29,45 @@ SETS = {name: {"u": 0.1 + 0.3 * i, "v": 0.9 - 0.2 * i} for i, name in enumerate(
 MATERIALS = Study.from_dict(RAW | {"materials": {"foam": {}, "soft": {}, "hard": {}}})
 
 
-def test_a_plan_is_reproduced_from_its_seed_and_survives_json():
+def written(folder, content):
+    """A plan that is read back, with the hash of this content."""
+    rest = {key: value for key, value in content.items() if key != "hash"}
+    text = json.dumps(rest, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
+    whole = rest | {"hash": hashlib.sha256(text.encode()).hexdigest()[:16]}
+    (folder / "plan.json").write_text(json.dumps(whole))
+    return read_plan(folder / "plan.json")
+
+
+def test_a_plan_is_reproduced_from_its_seed_and_survives_json(tmp_path):
     plan = make_plan(STUDY.file, PEOPLE, 3)
     assert plan == make_plan(STUDY.file, PEOPLE, 3) != make_plan(STUDY.file, PEOPLE, 4)
-    again = json.loads(json.dumps(plan))
-    assert plan_hash(again) == plan["hash"]
+    again = written(tmp_path, json.loads(plan_text(plan)))
+    assert again == plan
     header = planned_header(again, STUDY.file, "P03")
-    assert header.plan == plan["hash"] and header.participant == "P03"
+    assert header.plan == plan.hash and header.participant == "P03"
     assert [block.phase for block in header.blocks] == ["warm-up", "optimisation"]
-    seeds = [row["header"]["seed"] for row in plan["participants"]]
+    seeds = [row.header.seed for row in plan.participants]
     assert len(set(seeds)) == len(seeds)
 
 
-def test_a_changed_plan_another_study_and_strangers_are_refused():
+def test_a_changed_plan_another_study_and_strangers_are_refused(tmp_path):
     plan = make_plan(STUDY.file, PEOPLE, 3)
-    changed = json.loads(json.dumps(plan))
+    changed = json.loads(plan_text(plan))
     changed["participants"][0]["header"]["seed"] += 1
+    (tmp_path / "plan.json").write_text(json.dumps(changed))
     with pytest.raises(InputError, match="was changed after it was made"):
-        planned_header(changed, STUDY.file, "P01")
+        read_plan(tmp_path / "plan.json")
+    twice = json.loads(plan_text(plan))
+    twice["participants"][1] = twice["participants"][0]
+    with pytest.raises(InputError, match="names a participant twice"):
+        written(tmp_path, twice)
     with pytest.raises(InputError, match="belongs to another study"):
         planned_header(plan, MATERIALS.file, "P01")
     with pytest.raises(InputError, match='participant "P99" is not in the plan'):
         planned_header(plan, STUDY.file, "P99")
-    with pytest.raises(InputError, match="is no plan"):
-        planned_header({}, STUDY.file, "P01")
+    for content in ({}, json.loads(plan_text(plan)) | {"notes": ""}):
+        with pytest.raises(InputError, match="is no plan"):
+            written(tmp_path, content)
     with pytest.raises(InputError, match="each once"):
         make_plan(STUDY.file, ["P01", "P01"])
     for label in ("x" * 65, "a\nb", ""):
@@ -62,13 +78,13 @@ def test_a_changed_plan_another_study_and_strangers_are_refused():
 
 def test_three_materials_come_in_all_orders():
     plan = make_plan(MATERIALS.file, [f"P{i}" for i in range(12)], 0)
-    assert plan["complete"] and plan["complete_at"] == "multiples of 6 participants"
+    assert plan.complete and plan.complete_at == "multiples of 6 participants"
     seen = Counter(
-        tuple(b["material"] for b in row["header"]["blocks"] if b["phase"] == "optimisation")
-        for row in plan["participants"]
+        tuple(block.material for block in row.header.blocks if block.phase == "optimisation")
+        for row in plan.participants
     )
     assert len(seen) == 6 and set(seen.values()) == {2}
-    assert not make_plan(MATERIALS.file, [f"P{i}" for i in range(8)], 0)["complete"]
+    assert not make_plan(MATERIALS.file, [f"P{i}" for i in range(8)], 0).complete
 
 
 def test_validation_shows_each_pair_four_times_and_each_set_eight():
@@ -117,7 +133,7 @@ def test_a_plan_calls_nobodys_sets_by_their_id():
     assert plan == make_plan(STUDY.file, ["J01", "J02"], 0, "aggregate-best", sets=sets)
     header = planned_header(plan, STUDY.file, "J01")
     named = [name for name in header.sets if name.startswith("individual:")]
-    assert len(named) == 24 and not any(person in json.dumps(plan) for person in own)
+    assert len(named) == 24 and not any(person in plan_text(plan) for person in own)
     order = [header.sets[name]["u"] for name in named]
     assert order != sorted(order)  # nor does their order say whose they are
     assert {tuple(header.sets[name].items()) for name in named} == {tuple(values.items()) for values in own.values()}
@@ -141,24 +157,23 @@ FORGED_PLANS = {
 
 
 @pytest.mark.parametrize("words", FORGED_PLANS)
-def test_a_plan_whose_hash_fits_and_says_what_cannot_be_is_refused(words):
-    plan = json.loads(json.dumps(make_plan(STUDY.file, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate")))
+def test_a_plan_whose_hash_fits_and_says_what_cannot_be_is_refused(words, tmp_path):
+    plan = json.loads(plan_text(make_plan(STUDY.file, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate")))
     (*way, last), value = FORGED_PLANS[words]
     place = plan
     for key in way:
         place = place[key]
     place[last] = value
-    plan["hash"] = plan_hash(plan)
     with pytest.raises(InputError):
-        planned_header(plan, STUDY.file, "P01")
+        planned_header(written(tmp_path, plan), STUDY.file, "P01")
 
 
 def test_a_row_is_reissued_with_its_order_and_seed():
     plan = make_plan(MATERIALS.file, PEOPLE, 0)
     changed = reissue(plan, "P03", "P30")
     old, new = (planned_header(changed, MATERIALS.file, person) for person in ("P03", "P30"))
-    assert new == msgspec.structs.replace(old, participant="P30") and changed["hash"] != plan["hash"]
-    assert changed["replaces"] == [plan["hash"]]
+    assert new == msgspec.structs.replace(old, participant="P30") and changed.hash != plan.hash
+    assert changed.replaces == (plan.hash,)
     with pytest.raises(InputError, match="must be in the plan"):
         reissue(plan, "P99", "P30")
 
@@ -296,10 +311,10 @@ def test_a_wrong_session_table_is_one_sentence(session, sentence):
 
 
 def test_people_planned_in_two_batches_share_no_seed():
-    one, other = (make_plan(STUDY.file, people, seed=3)["participants"] for people in (["A1", "A2"], ["B1", "B2"]))
-    assert len({row["header"]["seed"] for row in [*one, *other]}) == 4
-    longer = make_plan(STUDY.file, ["A1", "A2", "A3"], seed=3)["participants"]
-    assert [row["header"]["seed"] for row in longer[:2]] == [row["header"]["seed"] for row in one]
+    one, other = (make_plan(STUDY.file, people, seed=3).participants for people in (["A1", "A2"], ["B1", "B2"]))
+    assert len({row.header.seed for row in [*one, *other]}) == 4
+    longer = make_plan(STUDY.file, ["A1", "A2", "A3"], seed=3).participants
+    assert [row.header.seed for row in longer[:2]] == [row.header.seed for row in one]
 
 
 def test_ids_that_differ_in_capitals_only_are_refused():

@@ -12,10 +12,11 @@ from hilbo.session.export.tables import read_sessions, sets_table
 from hilbo.session.log import actions as live
 from hilbo.session.log.event_log import EventLog
 from hilbo.session.log.log_files import log_name
-from hilbo.session.log.records import Block, Header, Planned
+from hilbo.session.log.records import Header
 from hilbo.session.log.state import LiveSession
 from hilbo.session.plan.plan import make_plan, planned_header
 from hilbo.statistics.paper_tables import paper_tables
+from hilbo.study.file.plan_file import Block, Planned
 from hilbo.study.tables.validation import read_validation, sets_frame
 
 MATERIALS = ("foam", "soft")

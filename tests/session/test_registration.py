@@ -1,17 +1,16 @@
 """The page for a pre-registration: what files fix stands there, and what they do not is left to its author."""
 
-import json
 from pathlib import Path
 
 import pytest
 from commands import run
 
-from hilbo.errors import InputError
 from hilbo.population.rules.registry import RECIPES, RULES
 from hilbo.report.registration import registration
 from hilbo.session.plan.plan import make_plan, reissue
 from hilbo.study.departures import Held, departures
 from hilbo.study.estimate.optimum import _LOSS
+from hilbo.study.file.plan_file import plan_text, read_plan
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.template import NewStudy, parameter_of, study_text
 
@@ -92,16 +91,16 @@ def test_the_primary_result_is_the_optimum_of_the_study_s_rule(page, rule):
 def planned(tmp_path, text="", **others):
     study = StudyFile.load(PAPER)
     path = tmp_path / "plan.json"
-    path.write_text(text or json.dumps(make_plan(study, ["P01", "P02"], 0, **others)))
+    path.write_text(text or plan_text(make_plan(study, ["P01", "P02"], 0, **others)))
     return path, study.hash
 
 
 def test_departures_from_a_plan(tmp_path):
     path, study = planned(tmp_path)
-    departs, (nothing,) = departures(path, study, 25, {"P01": [25], "P02": [25]})
+    departs, (nothing,) = departures(read_plan(path), study, 25, {"P01": [25], "P02": [25]})
     assert departs == ()
     assert nothing.startswith("Nothing departs from the plan") and "2 participants, 25 answers each" in nothing
-    sentences, nothing = departures(path, "0" * 16, 25, {"P01": [12, 25], "P09": [25]})
+    sentences, nothing = departures(read_plan(path), "0" * 16, 25, {"P01": [12, 25], "P09": [25]})
     assert nothing == () and all(sentence.startswith("Departs from the plan") for sentence in sentences)
     text = " ".join(sentences)
     for part in ("planned with (0000", "without answers here: P02 (1 of 2)", "Not in the plan", "P09.", "P01 (12, 25)"):
@@ -111,16 +110,16 @@ def test_departures_from_a_plan(tmp_path):
 
 def test_sessions_that_were_held_by_no_plan_or_by_another_are_named(tmp_path):
     path, study = planned(tmp_path)
-    plan, counts = json.loads(path.read_text()), {"P01": [25], "P02": [25]}
+    plan, counts = read_plan(path), {"P01": [25], "P02": [25]}
 
     def said(*plans):
         sessions = [Held(name, "1", by) for name, by in zip(counts, plans, strict=False)]
-        return departures(path, study, 25, counts, sessions)
+        return departures(read_plan(path), study, 25, counts, sessions)
 
-    own = plan["hash"]
+    own = plan.hash
     departs, (nothing,) = said(own, own)
     assert departs == () and nothing.endswith("25 answers each; their sessions were held by it.")
-    assert "by which plan they were held is not said here" in departures(path, study, 25, counts)[1][0]
+    assert "by which plan they were held is not said here" in departures(plan, study, 25, counts)[1][0]
     (sentence,), nothing = said(own, "")
     assert nothing == () and sentence == f"Departs from the plan {own}. Held by no plan: P02 (session 1)."
     (sentence,), _ = said("0123", own)
@@ -128,15 +127,9 @@ def test_sessions_that_were_held_by_no_plan_or_by_another_are_named(tmp_path):
     (sentence,), _ = said(own)
     assert sentence.endswith("does not say by which plan these were held: P02.")
     twice = reissue(reissue(plan, "P02", "P03"), "P03", "P04")
-    path.write_text(json.dumps(twice))
-    assert twice["replaces"][0] == own and len({*twice["replaces"], twice["hash"]}) == 3
-    assert not any("plan:" in sentence for sentence in said(*twice["replaces"])[0])
-
-
-def test_a_file_that_is_no_plan_is_refused(tmp_path):
-    path, study = planned(tmp_path, text='{"schema": 1}')
-    with pytest.raises(InputError, match="is no plan; make one with hilbo plan"):
-        departures(path, study, 25, {"P01": [25]})
+    path.write_text(plan_text(twice))
+    assert twice.replaces[0] == own and len({*twice.replaces, twice.hash}) == 3
+    assert not any("plan:" in sentence for sentence in said(*twice.replaces)[0])
 
 
 @pytest.mark.parametrize(

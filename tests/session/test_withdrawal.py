@@ -14,14 +14,15 @@ from withdrawn_study import SETS, older_log
 from hilbo.cli.terminal.console import results
 from hilbo.errors import InputError
 from hilbo.session.log.event_log import EventLog
-from hilbo.session.log.records import Block, Header, Planned
+from hilbo.session.log.records import Header
 from hilbo.session.plan.participants import read_people
-from hilbo.session.plan.plan import make_plan, plan_hash, planned_header, reissue
+from hilbo.session.plan.plan import make_plan, planned_header, planned_part, reissue
 from hilbo.session.withdrawal import withdrawal
 from hilbo.session.withdrawal.changes import command_without
 from hilbo.session.withdrawal.withdrawal import delete_participant
 from hilbo.study.cohort import read_trials
 from hilbo.study.disk.lock import locked_folder
+from hilbo.study.file.plan_file import Block, Planned, PlanRow, hashed, plan_text, read_plan
 from hilbo.study.results.listing import list_files, listed
 from hilbo.study.tables.validation import read_validation, sets_frame
 
@@ -41,7 +42,7 @@ def folder(tmp_path):
     compared = [(p, 1, "best", "own-P02", "", "", "own-P02") for p in ("P02", "P03")]
     columns = ["participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred"]
     pd.DataFrame(compared, columns=columns).to_csv(tmp_path / "validation.csv", index=False)
-    (tmp_path / "plan.json").write_text(json.dumps(make_plan(STUDY.file, ["P01", "P02", "P03"], 0)))
+    (tmp_path / "plan.json").write_text(plan_text(make_plan(STUDY.file, ["P01", "P02", "P03"], 0)))
     return tmp_path
 
 
@@ -95,12 +96,12 @@ def test_a_set_that_nobody_else_compared_goes(folder, capsys, monkeypatch):
 
 
 def test_a_plan_keeps_its_order_and_says_which_it_replaces(folder, capsys, monkeypatch):
-    before = json.loads((folder / "plan.json").read_text())
+    before = read_plan(folder / "plan.json")
     delete(capsys, monkeypatch, folder, "P02")
-    after = json.loads((folder / "plan.json").read_text())
-    assert after["replaces"] == [before["hash"]] != [after["hash"]]
+    after = read_plan(folder / "plan.json")
+    assert after.replaces == (before.hash,) != (after.hash,)
     assert planned_header(after, STUDY.file, "P03").seed == planned_header(before, STUDY.file, "P03").seed
-    label = after["participants"][1]["participant"]
+    label = after.participants[1].participant
     fresh = reissue(after, label, "P30")
     assert planned_header(fresh, STUDY.file, "P30").seed == planned_header(before, STUDY.file, "P02").seed
     with pytest.raises(InputError, match="not in the plan"):
@@ -192,14 +193,13 @@ def test_a_plan_of_today_leaves_no_id_with_others():
 
 
 def test_an_id_that_is_a_number_changes_names_alone(tmp_path):
-    plan = json.loads(json.dumps(make_plan(STUDY.file, ["1", "2", "3"], 0)))
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    plan = make_plan(STUDY.file, ["1", "2", "3"], 0)
+    (tmp_path / "plan.json").write_text(plan_text(plan))
     done = delete_participant(tmp_path, "1")
-    after = json.loads((tmp_path / "plan.json").read_text())
-    for row, was in zip(after["participants"][1:], plan["participants"][1:], strict=True):
-        assert row == was
-    first, was = after["participants"][0]["header"], plan["participants"][0]["header"]
-    assert first == was | {"participant": done.label}
+    after = read_plan(tmp_path / "plan.json")
+    assert after.participants[1:] == plan.participants[1:]
+    first, was = after.participants[0].header, plan.participants[0].header
+    assert first == msgspec.structs.replace(was, participant=done.label)
     assert planned_header(after, STUDY.file, "2").session == "1"
 
 
@@ -209,11 +209,11 @@ def test_names_of_sets_in_a_plan_change_with_the_trials_that_show_them(tmp_path)
     rows = []
     for order, person in enumerate(["P01", "P02"]):
         header = Header(study=STUDY.file.hash, participant=person, session="3", seed=order, blocks=(block,), sets=sets)
-        rows.append({"participant": person, "order": order, "header": msgspec.to_builtins(header)})
-    plan = {"schema": 1, "study": STUDY.file.hash, "phase": "aggregate-best", "source": None, "participants": rows}
-    (tmp_path / "plan.json").write_text(json.dumps(plan | {"hash": plan_hash(plan)}))
+        rows.append(PlanRow(person, order, planned_part(header)))
+    plan = msgspec.structs.replace(make_plan(STUDY.file, ["P01"]), phase="aggregate-best", participants=tuple(rows))
+    (tmp_path / "plan.json").write_text(plan_text(hashed(plan)))
     done = delete_participant(tmp_path, "P02")
-    header = planned_header(json.loads((tmp_path / "plan.json").read_text()), STUDY.file, "P01")
+    header = planned_header(read_plan(tmp_path / "plan.json"), STUDY.file, "P01")
     assert list(header.sets) == ["aggregate", f"individual:{done.label}", "individual:P020"]
 
 
@@ -314,7 +314,7 @@ def test_a_number_is_an_id_where_ids_stand_alone(tmp_path):
     (tmp_path / "t.csv").write_text("participant,trial,u\n1,1,1\n2,1,1\n")
     (tmp_path / "device.csv").write_text("time,force\n1,1\n")
     (tmp_path / "subjects.csv").write_text("subject;age\n1;30\n")
-    (tmp_path / "plan.json").write_text(json.dumps(make_plan(STUDY.file, ["2", "3"], 0)))
+    (tmp_path / "plan.json").write_text(plan_text(make_plan(STUDY.file, ["2", "3"], 0)))
     (tmp_path / "notes.md").write_text("1 of 2 motors was warm.")
     (tmp_path / "diary.md").write_text("Participant 1 came late.")
     driver = Driver()

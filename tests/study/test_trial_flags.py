@@ -9,6 +9,8 @@ from studies import PLAIN
 
 from hilbo import Study
 from hilbo.errors import InputError, InputRemark
+from hilbo.session.plan.plan import make_plan
+from hilbo.study.file.plan_file import plan_text
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.file.trial_flags import FLAGS, flag_sentences, flag_words
 from hilbo.study.folder import read_folder
@@ -161,14 +163,8 @@ def test_excluded_trials_were_held_as_planned(tmp_path):
     read(tmp_path, text, rule=RULE)
     with (tmp_path / "study.toml").open("a") as file:
         file.write("[selection]\ntrials = 2\nspace_filling = 1\n")
-    people = [{"participant": name, "blocks": []} for name in "AB"]
-    plan = {
-        "study": StudyFile.load(tmp_path / "study.toml").hash,
-        "hash": "0",
-        "phase": "optimisation",
-        "participants": people,
-    }
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    plan = make_plan(StudyFile.load(tmp_path / "study.toml"), ["A", "B"])
+    (tmp_path / "plan.json").write_text(plan_text(plan))
     assert not any("number of answers" in limit for limit in read_folder(tmp_path).limits)
 
 

@@ -7,8 +7,9 @@ import json
 
 from hilbo import Study
 from hilbo.session.log import actions as live
-from hilbo.session.log.records import Block, Header, Planned, RefusedError
+from hilbo.session.log.records import Header, RefusedError
 from hilbo.session.log.state import LiveSession
+from hilbo.study.file.plan_file import Block, Planned
 
 RAW = {
     "schema": 1,

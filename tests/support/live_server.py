@@ -28,10 +28,11 @@ from hilbo.errors import InputError
 from hilbo.hardware_bridge import Renderer, State
 from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.log.event_log import EventLog, read_log
-from hilbo.session.log.records import Block, Header, Planned
+from hilbo.session.log.records import Header
 from hilbo.session.log.state import LiveSession
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
+from hilbo.study.file.plan_file import Block, Planned
 
 __all__ = ["DATA", "PATIENCE", "Live", "ask", "check_blinding", "listen", "refused", "study_of", "until_held"]
 

@@ -11,8 +11,8 @@ from live_server import Live
 
 from hilbo.app.rehearsal.robot import Client
 from hilbo.app.rigs.stimulus_rig import StimulusRig
-from hilbo.session.log.records import Block, Planned
 from hilbo.study.config import Study
+from hilbo.study.file.plan_file import Block, Planned
 
 __all__ = [
     "CLIENTS",

@@ -13,12 +13,13 @@ from hilbo.cli.terminal.new_file import write_new
 from hilbo.errors import InputError
 from hilbo.session.log.event_log import EventLog, read_log
 from hilbo.session.log.log_files import log_name
-from hilbo.session.log.records import Block, Header, Planned
+from hilbo.session.log.records import Header
 from hilbo.session.plan.participants import add_person
-from hilbo.session.plan.plan import plan_hash
+from hilbo.session.plan.plan import make_plan
 from hilbo.session.withdrawal.withdrawal import delete_participant
 from hilbo.study.disk.lock import JOURNAL, LOCK
 from hilbo.study.disk.new_folder import new_folder
+from hilbo.study.file.plan_file import Block, Planned, plan_text, read_plan
 from hilbo.study.results.listing import LIST, digest, list_files, listed
 
 __all__ = ["PEOPLE", "SETS", "Schedule", "contents", "faults", "make_study", "naming", "older_log"]
@@ -61,11 +62,7 @@ def make_study(folder: Path, logs: list[Path]) -> None:
         *(["P02", "2", "s00000001 best", "s00000001 mid"], ["P03", "2", "best", "s00000003 best"]),
     ]
     _write(folder / "validation.csv", ["participant", "trial", "set_a", "set_b"], compared)
-    plan = {
-        "phase": "optimisation",
-        "participants": [{"participant": name, "header": {"seed": i}} for i, name in enumerate(PEOPLE)],
-    }
-    (folder / "plan.json").write_text(json.dumps(plan | {"hash": plan_hash(plan)}))
+    (folder / "plan.json").write_text(plan_text(make_plan(STUDY.file, PEOPLE)))
     (folder / "logs").mkdir()
     for path in logs:
         (folder / "logs" / path.name).write_bytes(path.read_bytes())
@@ -125,10 +122,9 @@ def faults(folder: Path, gone: set[str], there: set[str]) -> list[str]:
     sets = {row["set_id"] for row in _rows(folder / "sets.csv")}
     named = {row[k] for row in _rows(folder / "validation.csv") for k in ("set_a", "set_b")}
     said += [f"{name} is in no sets.csv" for name in named - sets]
-    plan = json.loads((folder / "plan.json").read_text())
-    said += [] if plan["hash"] == plan_hash(plan) else ["the plan's hash does not fit"]
-    said += [] if len(plan["participants"]) == len(PEOPLE) else ["the plan has lost a row"]
-    said += [f"{p} is missing in the plan" for p in there & set(PEOPLE) if p not in str(plan["participants"])]
+    planned = {row.participant for row in read_plan(folder / "plan.json").participants}
+    said += [] if len(planned) == len(PEOPLE) else ["the plan has lost a row"]
+    said += [f"{p} is missing in the plan" for p in there & set(PEOPLE) if p not in planned]
     for path in folder.rglob("*.session.jsonl"):
         read_log(path)
     for path in folder.rglob(LIST):

@@ -24,8 +24,9 @@ from hilbo.session.log.log_files import begun, log_name
 from hilbo.session.log.records import Header
 from hilbo.session.log.state import LiveSession
 from hilbo.session.plan.participants import check_consent, read_people
-from hilbo.session.plan.plan import planned_by, planned_header, read_plan
+from hilbo.session.plan.plan import planned_by, planned_header
 from hilbo.study.config import Study
+from hilbo.study.file.plan_file import read_plan
 from hilbo.study.file.reading import StudyFile
 
 __all__ = ["Wanted", "let_go", "opened"]

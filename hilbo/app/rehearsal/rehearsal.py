@@ -32,6 +32,7 @@ from hilbo.simulation import simulate
 from hilbo.simulation.presets import population_of, with_truth
 from hilbo.simulation.simulate import Population
 from hilbo.study.config import Study
+from hilbo.study.file.plan_file import Plan, plan_text
 
 __all__ = ["HILBO", "Decider", "example_sets", "fast_study", "rehearse", "server"]
 
@@ -158,7 +159,7 @@ def rehearse(
     if phase != "optimisation":
         made = _plan(study, material, example_sets(here, population), phase, seed)
         plan = out / "plan.json"
-        plan.write_text(json.dumps(made, indent=2), encoding="utf-8")
+        plan.write_text(plan_text(made), encoding="utf-8")
         arguments += ["--plan", str(plan)]  # which has the seed
     else:
         arguments += ["--seed", str(seed)] + ([] if material is None else ["--material", material])
@@ -196,7 +197,7 @@ def _by_stand_in(study, arguments, decide):
         )
 
 
-def _plan(study, material, sets, phase, seed) -> dict[str, Any]:
+def _plan(study, material, sets, phase, seed) -> Plan:
     """Of one session, with one of the study's materials."""
     if phase == "aggregate-best":
         sets = {"aggregate": sets["best"], "individual:S1": sets["mid"], "individual:S2": sets["worst"]}

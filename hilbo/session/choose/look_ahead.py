@@ -23,9 +23,10 @@ from hilbo.session.choose.choice import Answers, explained, next_point
 from hilbo.session.choose.step import Fitted
 from hilbo.session.choose.warm_start import WarmStart
 from hilbo.session.log.header import material_seed
-from hilbo.session.log.records import Need, Planned
+from hilbo.session.log.records import Need
 from hilbo.session.log.state import LiveSession
 from hilbo.study.config import Study
+from hilbo.study.file.plan_file import Planned
 
 __all__ = ["LiveChooser", "warm_start_sources"]
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from hilbo.session.log.header_check import SCHEMA, study_of
-from hilbo.session.log.records import Block, Header, Planned
+from hilbo.session.log.records import Header
+from hilbo.study.file.plan_file import Block, Planned
 from hilbo.study.file.protocols import protocol
 from hilbo.study.file.reading import StudyFile
 

@@ -3,7 +3,8 @@
 import math
 
 from hilbo.errors import InputError
-from hilbo.session.log.records import Block, Header
+from hilbo.session.log.records import Header
+from hilbo.study.file.plan_file import Block
 from hilbo.study.file.protocols import protocol
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.cell_text import check_id, check_text

@@ -10,9 +10,9 @@ from typing import Any, Literal
 import msgspec
 
 from hilbo.errors import InputError
-from hilbo.study.file.protocols import Phase
+from hilbo.study.file.plan_file import Block
 
-__all__ = ["Block", "Event", "Header", "Need", "Planned", "RefusedError", "Status", "Trial"]
+__all__ = ["Event", "Header", "Need", "RefusedError", "Status", "Trial"]
 
 Status = Literal["pending", "answered", "undone", "void", "dropped", "left out"]
 
@@ -33,28 +33,6 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     kind: str
     time: float
     data: dict[str, Any]
-
-
-class Planned(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A trial whose renderings are known in advance: names of sets in the header, and which side is felt first."""
-
-    a: str
-    b: str | None = None
-    first: Literal["a", "b"] = "a"
-
-
-class Block(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A run of trials of one phase with one material.
-
-    `count` of them are needed; `trials` are the planned ones, more than `count` for a warm-up, whose others wait for
-    "another one"; none for an optimisation, which chooses them. `rest`: seconds of break before the block.
-    """
-
-    phase: Phase
-    count: int
-    trials: tuple[Planned, ...] = ()
-    material: str | None = None
-    rest: float = 0.0
 
 
 class Header(msgspec.Struct, frozen=True, kw_only=True):

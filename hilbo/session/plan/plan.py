@@ -1,7 +1,7 @@
 """A study's sessions in advance: who is shown what, in which order, from one seed; to be registered before it begins.
 
-`make_plan` gives the whole study as plain data, `plan_hash` what stands in every log, `planned_header` one session of
-it. Materials come in the orders of a Williams design, pairs balanced as `hilbo.session.plan.counterbalance` says.
+`make_plan` gives the plan of a whole study, whose hash stands in every log, `planned_header` one session of it.
+Materials come in the orders of a Williams design, pairs balanced as `hilbo.session.plan.counterbalance` says.
 
 A validation compares best, mid and worst: of the population's map (`source` aggregate; for people who were not in it),
 or of each participant's own (individual; for these very people). An aggregate-best validation compares the population's
@@ -9,58 +9,33 @@ optimum with every individual's own. Sets of individuals are called by a code th
 plans, logs and tables: whoever withdraws leaves no id in the answers of others.
 """
 
-import hashlib
-import json
-import os
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from hilbo.errors import InputError
 from hilbo.session.log.header import header_for, header_of, participant_seed, seed_of, warm_up
 from hilbo.session.log.header_check import SCHEMA, check_header
-from hilbo.session.log.records import Block, Header, Planned
+from hilbo.session.log.records import Header
 from hilbo.session.plan.counterbalance import block_size, comparisons, orders
 from hilbo.session.plan.set_codes import OWN, Sets, coded, set_codes
+from hilbo.study.file.plan_file import Block, Plan, Planned, PlannedSession, PlanRow, Source, hashed
 from hilbo.study.file.protocols import Phase, protocol
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.cell_text import but_for_case, check_id, check_text
-from hilbo.study.formats.json_file import converted, decoded, read_bytes
 
 __all__ = [
-    "Source",
     "check_plan",
     "make_plan",
-    "plan_hash",
     "planned_by",
     "planned_header",
-    "read_plan",
+    "planned_part",
     "reissue",
 ]
 
-Source = Literal["aggregate", "individual"]
-_WHAT = "is no plan; make one with hilbo plan"
 _PAIRS = (("best", "mid"), ("best", "worst"), ("mid", "worst"))
-
-
-class _Row(msgspec.Struct):
-    """Who has which session."""
-
-    participant: str
-    header: Header
-    order: Annotated[int, msgspec.Meta(ge=0)] = 0
-    reissued_from: str | None = None
-
-
-class _Plan(msgspec.Struct):
-    """What is read of a plan."""
-
-    hash: str
-    study: str
-    participants: Annotated[tuple[_Row, ...], msgspec.Meta(min_length=1)]
-    source: Source | None = None
-    replaces: tuple[str, ...] = ()
 
 
 def make_plan(
@@ -73,8 +48,8 @@ def make_plan(
     session: str = "1",
     sets: Mapping[str, Sets] | None = None,
     source: Source | None = None,
-) -> dict[str, Any]:
-    """The plan of one kind of session for everybody, as plain data.
+) -> Plan:
+    """The plan of one kind of session for everybody.
 
     **Arguments:** `materials`: all that each participant has, by default those of the study. `sets`: for validations
     material ("" for a study without) -> name of a set -> parameters; names are `best`, `mid` and `worst`, or with an
@@ -96,104 +71,79 @@ def make_plan(
         in_order = [names[k] for k in sequence[i]]
         header = _header(study, person, session, participant_seed(seed, person), phase, in_order, sets, source, codes)
         check_header(study, header)
-        people.append({"participant": person, "order": i, "header": _for_plan(header)})
+        people.append(PlanRow(person, i, planned_part(header)))
     size = block_size(len(names))
-    plan = {
-        "schema": 1,
-        "study": study.hash,
-        "name": study.name,
-        "seed": seed,
-        "phase": phase,
-        "source": source,
-        "materials": names,
-        "complete_at": "any number of participants" if size == 1 else f"multiples of {size} participants",
-        "complete": len(participants) % size == 0,
-        "participants": people,
-    }
-    return plan | {"hash": plan_hash(plan)}
+    plan = Plan(
+        schema=1,
+        study=study.hash,
+        name=study.name,
+        seed=seed,
+        phase=phase,
+        source=source,
+        materials=tuple(names),
+        complete_at="any number of participants" if size == 1 else f"multiples of {size} participants",
+        complete=len(participants) % size == 0,
+        participants=tuple(people),
+        hash="",
+    )
+    return hashed(plan)
 
 
-def plan_hash(plan: Mapping[str, Any]) -> str:
-    """First 16 hex digits of the SHA-256 of a plan's content, its own hash left out."""
-    content = {key: value for key, value in plan.items() if key != "hash"}
-    text = json.dumps(content, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def planned_header(plan: Mapping[str, Any], study: StudyFile, participant: str, **others: Any) -> Header:
+def planned_header(plan: Plan, study: StudyFile, participant: str, **others: Any) -> Header:
     """The header of a planned session. Raises InputError if plan, study and participant do not belong together."""
-    checked = check_plan(plan, study)
-    rows = {row.participant: row.header for row in checked.participants}
+    check_plan(plan, study)
+    rows = {row.participant: row for row in plan.participants}
     if participant not in rows:
         raise InputError(
             f'participant "{participant}" is not in the plan, which has {len(rows)}, {min(rows)} to {max(rows)}; add'
             " them by a new plan, or reissue the row of somebody who dropped out."
         )
-    return msgspec.structs.replace(rows[participant], schema=SCHEMA, plan=checked.hash, **others)
+    return replace(_header_of_row(rows[participant]), plan=plan.hash, **others)
 
 
-def planned_by(plan: Mapping[str, Any], planned: Header, begun: Header) -> bool:
+def planned_by(plan: Plan, planned: Header, begun: Header) -> bool:
     """Whether a session was begun by this plan, or by one that it replaces and with the same row; `planned` is what the
     row gives today. Its label may be another."""
-    known = begun.plan in (plan["hash"], *plan.get("replaces", ()))
-    return known and _for_plan(begun) == _for_plan(msgspec.structs.replace(planned, session=begun.session))
+    known = begun.plan in (plan.hash, *plan.replaces)
+    return known and planned_part(begun) == planned_part(replace(planned, session=begun.session))
 
 
-def read_plan(path: str | os.PathLike) -> dict[str, Any]:
-    """A plan's content as plain data, which `check_plan` checks. Raises InputError."""
-    return decoded(read_bytes(path), dict[str, Any], str(path), _WHAT)
-
-
-def check_plan(plan: Mapping[str, Any], study: StudyFile) -> _Plan:
-    """Refuse a plan that was changed after it was made, belongs to another study, or has sessions that cannot be.
-
-    Raises `InputError`, with what to do.
-    """
-    checked = converted(plan, _Plan, "the plan", _WHAT)
-    if checked.hash != plan_hash(plan):
-        raise InputError("the plan was changed after it was made (its hash does not fit); make a new one.")
-    if checked.study != study.hash:
+def check_plan(plan: Plan, study: StudyFile) -> None:
+    """Refuse a plan that belongs to another study, or has sessions that cannot be. Raises InputError."""
+    if plan.study != study.hash:
         raise InputError(
-            f"the plan belongs to another study ({checked.study}, not {study.hash}); use the study file it was made"
-            " from."
+            f"the plan belongs to another study ({plan.study}, not {study.hash}); use the study file it was made from."
         )
-    names = [row.participant for row in checked.participants]
-    if len(set(names)) < len(names):
-        raise InputError("the plan names a participant twice; make a new one.")
-    for row in checked.participants:
-        check_header(study, row.header)
-        if row.header.participant != row.participant or row.header.study != checked.study:
+    for row in plan.participants:
+        check_header(study, _header_of_row(row))
+        if row.header.participant != row.participant or row.header.study != plan.study:
             raise InputError(f"the plan's row of {row.participant} has somebody else's session; make a new one.")
-    return checked
 
 
-def reissue(plan: Mapping[str, Any], dropped: str, new: str) -> dict[str, Any]:
+def reissue(plan: Plan, dropped: str, new: str) -> Plan:
     """The plan in which somebody new has the row (order, seed, sets) of a participant who dropped out. A row is given
     away once. `replaces` keeps the hash that logs have. Raises InputError."""
     check_id(new, "plan")
-    rows = [row["participant"] for row in plan["participants"]]
+    rows = {row.participant: row for row in plan.participants}
     if dropped not in rows or new in rows:
         raise InputError(f'plan: "{dropped}" must be in the plan and "{new}" must not.')
-    given = {row.get("reissued_from"): row["participant"] for row in plan["participants"]}
+    given = {row.reissued_from: row.participant for row in plan.participants}
     if dropped in given:
         raise InputError(f'plan: the row of "{dropped}" has been reissued to {given[dropped]}; reissue that one.')
-    if plan["source"] == "individual":
+    if plan.source == "individual":
         raise InputError(f'plan: the sets of "{dropped}" are their own; nobody else can be validated with them.')
-    row = plan["participants"][rows.index(dropped)]
-    fresh = {
-        "participant": new,
-        "order": row["order"],
-        "reissued_from": dropped,
-        "header": row["header"] | {"participant": new},
-    }
-    replaces = [*plan.get("replaces", []), plan["hash"]]  # which is in the logs that there are
-    changed = {**plan, "participants": [*plan["participants"], fresh], "replaces": replaces}
-    return changed | {"hash": plan_hash(changed)}
+    row = rows[dropped]
+    fresh = PlanRow(new, row.order, replace(row.header, participant=new), dropped)
+    return hashed(replace(plan, participants=(*plan.participants, fresh), replaces=(*plan.replaces, plan.hash)))
 
 
-def _for_plan(header: Header):
-    content = msgspec.to_builtins(header)
-    return {key: content[key] for key in ("study", "participant", "session", "seed", "blocks", "sets", "language")}
+def planned_part(header: Header) -> PlannedSession:
+    """The part of a header that a plan fixes."""
+    return PlannedSession(*(getattr(header, name) for name in PlannedSession.__struct_fields__))
+
+
+def _header_of_row(row: PlanRow) -> Header:
+    return Header(schema=SCHEMA, **msgspec.structs.asdict(row.header))
 
 
 def _header(study, person, session, seed, phase, materials, sets, source, codes) -> Header:

@@ -10,18 +10,17 @@ taken for a name: an id such as 1 or a is also a session's label, a number, or a
 import contextlib
 import io
 import itertools
-import json
 import re
 import shlex
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import msgspec
+from msgspec.structs import replace
 
 from hilbo.errors import InputError
-from hilbo.session.plan.plan import plan_hash
 from hilbo.session.plan.set_codes import OWN
+from hilbo.study.file.plan_file import Planned, PlanRow, hashed, plan_in, plan_text
 from hilbo.study.formats.csv_rows import csv_rows, csv_text
 from hilbo.study.tables.parameter_sets import ROLES
 
@@ -30,7 +29,6 @@ __all__ = [
     "Cells",
     "Edited",
     "command_without",
-    "is_plan",
     "named_sets",
     "plan_without",
     "read_table",
@@ -162,70 +160,39 @@ def _new_cell(cell: str, column: str, names: Mapping[str, str]) -> str:
     return cell if column not in _SET_COLUMNS or side else names.get(cell.strip(), cell)
 
 
-class _Named(msgspec.Struct):
-    participant: str
-    reissued_from: str | None = None
-
-
-class _PlanLike(msgspec.Struct):
-    hash: str
-    phase: str
-    participants: list[_Named]
-
-
-def is_plan(content: bytes) -> bool:
-    """Whether this is the content of a plan."""
-    try:
-        msgspec.json.decode(content, type=_PlanLike)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return False
-    return True
-
-
 def plan_without(content: bytes, participant: str, label: str) -> str | None:
     """A plan with a label in the place of a participant, and another hash; `replaces` keeps the one that logs have. A
     session of their own sets goes. None where a file is no plan, or has nothing of theirs."""
-    if not is_plan(content):
+    plan = plan_in(content)
+    if plan is None or not any(participant in (row.participant, row.reissued_from) for row in plan.participants):
         return None
-    typed = msgspec.json.decode(content, type=_PlanLike)
-    plan: dict[str, Any] = msgspec.json.decode(content)
-    if participant not in {name for row in typed.participants for name in (row.participant, row.reissued_from)}:
-        return None
-    whole = plan["hash"] == plan_hash(plan)
-    plan["participants"] = [
-        _row_without(row, participant, label, plan.get("materials") or ())
-        for row in plan["participants"]
-        if not (row["participant"] == participant and plan.get("source") == "individual")
-    ]
-    plan["replaces"] = [*plan.get("replaces", []), plan["hash"]]
-    plan["hash"] = plan_hash(plan) if whole else plan["hash"]
-    return json.dumps(plan, indent=1, ensure_ascii=False) + "\n"
+    rows = tuple(
+        _row_without(row, participant, label, plan.materials)
+        for row in plan.participants
+        if not (row.participant == participant and plan.source == "individual")
+    )
+    changed = replace(plan, participants=rows, replaces=(*plan.replaces, plan.hash))
+    return plan_text(hashed(changed) if plan.intact else changed)
 
 
-def _row_without(row: dict[str, Any], participant: str, label: str, materials: Iterable[str | None]) -> dict[str, Any]:
+def _row_without(row: PlanRow, participant: str, label: str, materials: Sequence[str | None]) -> PlanRow:
     """A plan's row with the label where the participant is named, and in names of sets from their map."""
 
-    def person(values: dict[str, Any], *keys: str) -> dict[str, Any]:
-        return values | {key: label for key in keys if values.get(key) == participant}
+    def set_name(name: str) -> str:
+        return _renamed_set(name, participant, label, materials)
 
-    def trial(planned: Any) -> Any:
-        sides = {side: planned[side] for side in ("a", "b") if isinstance(planned, dict) and planned.get(side)}
-        new_names = {side: _renamed_set(str(name), participant, label, materials) for side, name in sides.items()}
-        return planned | new_names if new_names else planned
+    def trial(planned: Planned) -> Planned:
+        return replace(planned, a=set_name(planned.a), b=None if planned.b is None else set_name(planned.b))
 
-    def block(entry: Any) -> Any:
-        has_trials = isinstance(entry, dict) and isinstance(entry.get("trials"), list)
-        return entry | {"trials": [trial(planned) for planned in entry["trials"]]} if has_trials else entry
-
-    row, header = person(row, "participant", "reissued_from"), row.get("header")
-    if not isinstance(header, dict):
-        return row
-    header = person(header, "participant")
-    if isinstance(sets := header.get("sets"), dict):
-        header["sets"] = {_renamed_set(name, participant, label, materials): values for name, values in sets.items()}
-    if isinstance(blocks := header.get("blocks"), list):
-        header["blocks"] = [block(entry) for entry in blocks]
-    return row | {"header": header}
+    names = {participant: label}
+    header = replace(
+        row.header,
+        participant=names.get(row.header.participant, row.header.participant),
+        blocks=tuple(replace(block, trials=tuple(map(trial, block.trials))) for block in row.header.blocks),
+        sets={set_name(name): values for name, values in row.header.sets.items()},
+    )
+    person = names.get(row.participant, row.participant)
+    return PlanRow(person, row.order, header, label if row.reissued_from == participant else row.reissued_from)
 
 
 def command_without(command: str, participant: str) -> str:

@@ -21,7 +21,6 @@ from hilbo.errors import InputError
 from hilbo.session.log.log_files import in_use, keys_path
 from hilbo.session.withdrawal.changes import (
     Cells,
-    is_plan,
     plan_without,
     read_table,
     sets_of,
@@ -34,6 +33,7 @@ from hilbo.session.withdrawal.traces import Below, files_below
 from hilbo.study.disk.lock import JOURNAL, locked_folder, withdrawal_above
 from hilbo.study.disk.new_file import UNFINISHED, remove_unfinished, rewrite_file, write_file
 from hilbo.study.disk.new_folder import LEFTOVER, recover
+from hilbo.study.file.plan_file import plan_in
 from hilbo.study.results.listing import LIST
 
 __all__ = ["Withdrawal", "delete_participant"]
@@ -168,7 +168,7 @@ def _is_shared(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             return (path.suffix == ".csv" and b"consent_time" in file.readline(_HEAD)) or (
-                path.suffix == ".json" and is_plan(file.read())
+                path.suffix == ".json" and plan_in(file.read()) is not None
             )
     except OSError:  # which will be said
         return False
