@@ -145,7 +145,7 @@ def test_a_clear_after_the_rig_s_own_stop_is_carried_out():
 @pytest.mark.parametrize("counted", [False, True])
 @pytest.mark.parametrize("other", [False, True])
 def test_a_clear_while_the_rig_s_own_stop_is_under_way(counted, other):
-    """It is carried out, whether the device has counted the STOP or not; and not after another's stop, whenever that is."""
+    """Carried out, whether the device has counted STOP or not, and not after another's stop, whenever that is."""
     under_way, go_on = threading.Event(), threading.Event()
 
     class Slow(FakeDevice):
