@@ -64,7 +64,7 @@ MAY_IMPORT = {
     "report.figures": {"identification", "study.analysis"},
     "report": {"report.figures", "statistics", "simulation"},
     "report.study": {"report"},
-    "app.wire": {"study.disk"},
+    "app.wire": {"study.disk", "study.formats"},
     "app.rigs": {"app.wire", "hardware_bridge", "session.plan"},
     "app": {"app.rigs"},
     "app.pages": {"app", "session.choose"},
@@ -110,6 +110,13 @@ WITHOUT_JAX = {
 LATER = {"device.parameter_sets", "search.box", "session.plan.validation_sets"}
 OUTSIDE_WORLD = {"os", "io", "sys", "time", "datetime", "pathlib", "logging", "random", "socket", "subprocess"}
 MAY_ENABLE_X64 = {"cli.terminal.console", "app"}
+PARSERS = {"tomllib.loads", "json.load", "json.loads", "msgspec.json.decode", "msgspec.msgpack.decode"}
+# These read what is hilbo's own: data of the package, a study's checked content, its own server, kept programs.
+READ_THEIR_OWN = {
+    *("simulation.presets", "simulation.power", "study.file.languages", "study.file.reading", "study.folder"),
+    *("cli.doctor", "cli.device.commands", "app.server.server", "app.rehearsal.robot", "app.rehearsal.rehearsal"),
+    "programs.entries",
+}
 SAYS_NOTHING = {"found", "told", "told_of", "gone"}  # as names: what is it that was found?
 LONGEST = 400  # lines
 
@@ -263,6 +270,22 @@ def test_types_say_more_than_before():
                 every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
                 bare += any(arg.annotation is None for arg in every if arg.arg not in ("self", "cls"))
     assert (mentions <= MOST_ANY, bare <= MOST_BARE) == (True, True), (mentions, bare)
+
+
+def unguarded_parsers(tree):
+    """Calls of parsers outside of a `try` that catches all that they raise."""
+    guarded = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Try) and any("UNREADABLE" in ast.unparse(h.type) for h in node.handlers if h.type):
+            guarded |= {id(call) for part in node.body for call in ast.walk(part)}
+    calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call) and id(node) not in guarded)
+    return [call for call in calls if ast.unparse(call.func) in PARSERS]
+
+
+def test_what_a_parser_raises_is_caught_whole():
+    """A number of 5,000 digits and lists within lists are no syntax errors."""
+    found = {module_of(path) for path in SOURCES if unguarded_parsers(ast.parse(path.read_text(encoding="utf-8")))}
+    assert found == READ_THEIR_OWN | {"study.formats.parsing"}  # which has handlers of its own
 
 
 def test_no_cycles():

@@ -19,6 +19,7 @@ __all__ = ["MOST_PARAMETERS", "Box", "Constraint", "Mechanics", "Parameter"]
 
 
 MOST_PARAMETERS = 8
+_SMALLEST = 2.0**-1022  # of the normal floating-point numbers: those below lose digits, and JAX takes them for 0
 
 
 def _reads_as_a_number(text: str) -> bool:
@@ -59,6 +60,11 @@ class Parameter:
             raise InputError(f'{path}.scale is "{self.scale}"; it must be linear or log.')
         if self.scale == "log" and self.low <= 0:
             raise InputError(f'{path}.low is {self.low}; it must be above 0 on a scale = "log".')
+        ratio = self.scale == "log"
+        span = self.high / self.low if ratio else self.high - self.low
+        if not _SMALLEST <= span < math.inf:
+            words = f"high {'/' if ratio else '-'} low is {span}"
+            raise InputError(f"{path} runs from {self.low} to {self.high}, so that {words}; choose another unit.")
         for key, end in (("low", self.low), ("high", self.high)):
             if self.integer and end != round(end):
                 raise InputError(f"{path}.{key} is {end}; it must be a whole number where integer = true.")
@@ -91,6 +97,11 @@ class Parameter:
     def discrete(self) -> bool:
         """Whether only some values are allowed: whole numbers or levels."""
         return self.integer or bool(self.levels)
+
+    @property
+    def middle(self) -> float:
+        """Middle of the range, in physical units; finite where low + high is not."""
+        return 0.5 * self.low + 0.5 * self.high
 
     @property
     def steps(self) -> int:
@@ -273,6 +284,20 @@ class Box:
                 raise InputError(f"{path}.{key} is {end}; it must be a finite number, or be left out.")
         if least is not None and most is not None and not least < most:
             raise InputError(f"{path}.least is {least}; it must be below most = {most}.")
+        self._check_size(constraint, path)
+
+    def _check_size(self, constraint: Constraint, path: str) -> None:
+        """Raise `InputError` for a constraint whose sums are too large, or too small, for a floating-point number."""
+        terms = [(weight, self.parameters[self.names.index(name)]) for name, weight in constraint.terms]
+        spans = [weight * (p.high - p.low) for weight, p in terms]
+        size = sum(span * span for span in spans)  # its root is divided by
+        reach = sum(abs(weight) * max(abs(p.low), abs(p.high)) for weight, p in terms)
+        ends = [abs(end) for end in (constraint.least, constraint.most) if end is not None]
+        if not _SMALLEST <= size < math.inf or not sum(ends, reach) < math.inf:
+            raise InputError(
+                f"{path}.terms has a sum too large or too small for a computer; choose other units of the parameters,"
+                " or divide the weights, least and most by one number."
+            )
 
     def _check_model(self) -> None:
         """Raise `InputError` for parameters that do not suit the FO-SLS."""

@@ -136,7 +136,7 @@ def cohort_of(table: TrialTable | pd.DataFrame, study: Study, capacity: int | No
     categories = np.zeros((len(counts), capacity), np.int32)
     categories[rows] = answers["category"].to_numpy()[order]
     held = np.arange(capacity)[None, :] < counts[:, None]
-    middle = [(p.low + p.high) / 2 for p in study.space.parameters]
+    middle = [p.middle for p in study.space.parameters]
     x = _to_unit(study.space, np.where(held[..., None], physical, middle))
     asked = _asked(answers.iloc[order], rows, held.shape)
     texts = _random_effect(answers, study)

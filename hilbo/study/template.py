@@ -11,6 +11,7 @@ from hilbo.population.rules.registry import DEFAULT, RECOMMENDED
 from hilbo.search.box import Constraint, Parameter
 from hilbo.study.file.constraint_words import constraint_of
 from hilbo.study.file.reading import StudyFile, checked
+from hilbo.study.formats.parsing import UNREADABLE
 
 __all__ = ["NewStudy", "parameter_of", "study_text"]
 
@@ -136,7 +137,7 @@ def study_text(new: NewStudy) -> str:
     text += "" if new.device else _TEXTS + _definitions(new.responses)
     try:
         file = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except UNREADABLE as error:
         raise InputError(f"a name or an answer has what no file can hold ({error}); leave it out.") from error
     try:
         checked(file, "", _computed if constraints else _checked)

@@ -101,11 +101,18 @@ def test_a_link_that_could_not_be_opened_is_still_good_and_the_first_browser_sta
     assert gate.redeem(token) is None
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{", '{"keys": 1}', '{"keys": {"experimenter": 1}, "links": []}', "\0"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "[]", "{", '{"keys": 1}', '{"keys": {"experimenter": 1}, "links": []}', "\0"),
+        *("[" * 100_000, "1" * 5000, '{"keys": {"experimenter": "é"}, "links": {"experimenter": "é"}}'),
+    ],
+    ids=range(9),
+)
 def test_a_damaged_file_of_keys_admits_nobody(tmp_path, text):
-    (tmp_path / "keys").write_text(text)
+    (tmp_path / "keys").write_text(text, encoding="utf-8")
     gate = Gate([HERE], tmp_path / "keys")
-    assert not gate.admits("experimenter", "1")
+    assert not gate.admits("experimenter", "1") and gate.let_in("1") is None
     _, key = gate.redeem(gate.invite("experimenter"))
     assert Gate([HERE], tmp_path / "keys").admits("experimenter", key)
 

@@ -179,6 +179,8 @@ def test_constraints_that_leave_nothing_are_refused(constraints, sentence):
         (Constraint((("z", 1.0),), most=1.0), "constraints.1.terms names z, which is no parameter"),
         (Constraint((("a", 0.0),), most=1.0), "has no weight but 0"),
         (Constraint((("a", np.inf),), most=1.0), "must be a finite number"),
+        (Constraint((("a", 1e200), ("b", 1e200)), most=1.0), "constraints.1.terms has a sum too large or too small"),
+        (Constraint((("a", 1e-200),), most=1.0), "constraints.1.terms has a sum too large or too small"),
         (Constraint((("a", 1.0),), most=np.inf), "constraints.1.most is inf; it must be a finite number, or be left"),
         (Constraint((("a", 1.0),), least=np.nan), "constraints.1.least is nan"),
         (Constraint((("a", 1.0),)), "has no least and no most"),

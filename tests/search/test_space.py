@@ -329,6 +329,9 @@ def test_points_of_another_number_of_coordinates_are_refused(method, count):
         (lambda: Parameter("p", 2.0, 1.0), "parameters.p.low is 2.0; it must be below high = 1.0"),
         (lambda: Parameter("p", 1.0, 1.0), "it must be below"),
         (lambda: Parameter("p", 0.0, np.inf), "must be finite"),
+        (lambda: Parameter("p", -1e308, 1e308), "so that high - low is inf; choose another unit"),
+        (lambda: Parameter("p", 1e-300, 1e300, scale="log"), "so that high / low is inf"),
+        (lambda: Parameter("p", 0.0, 5e-324), "so that high - low is 5e-324"),
         (lambda: Parameter("p", 0.0, 1.0, scale="log"), "must be above 0"),
         (lambda: Mechanics(K_eff=0.44, damping=0.0), "renderer.damping is 0.0"),
         (lambda: Mechanics(K_eff=-0.1, damping=1.0), "renderer.K_eff is -0.1; it must be 0 or above"),
@@ -346,3 +349,9 @@ def test_points_of_another_number_of_coordinates_are_refused(method, count):
 def test_a_space_that_cannot_be_is_refused(build, sentence):
     with pytest.raises(InputError, match=sentence):
         build()
+
+
+def test_the_widest_range_has_finite_points():
+    parameter = Parameter("p", 0.5e308, 1.7e308)
+    assert parameter.middle == 1.1e308
+    assert np.all(np.isfinite(parameter.to_physical(np.linspace(0.0, 1.0, 11))))

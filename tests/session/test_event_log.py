@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from live import CHOOSER, RAW, STUDY, Driver, header
 
 from hilbo import Study
+from hilbo.app.pages.log_words import line
 from hilbo.errors import InputError
 from hilbo.session.log import actions as live
 from hilbo.session.log.event_log import EventLog, LogError, read_log
@@ -263,6 +264,42 @@ def test_a_failing_fsync_acknowledges_nothing(tmp_path, driven, monkeypatch):
         monkeypatch.undo()
         log.append(driven.events[1])
     assert read_log(path)[1] == driven.events[:2]
+
+
+@pytest.mark.parametrize("time", [-1.0, -5e10, 9e10])
+def test_whatever_the_clock_says_what_was_acknowledged_can_be_read(tmp_path, time):
+    path = tmp_path / "log.jsonl"
+    with EventLog.create(path, STUDY.file, header()) as log:
+        log.append(live.note(log.state, "early", time))
+        state = log.state
+    assert read_log(path)[1][0].time == time
+    with EventLog.resume(path, STUDY.file) as log:
+        assert log.state == state
+    assert line(state, read_log(path)[1][0])[2].endswith("early")
+
+
+READY = {"condition": "ready", "trial": None}
+
+
+@pytest.mark.parametrize(
+    ("event", "why"),
+    [
+        (Event(seq=1, kind="note", time=-1e11, data={"text": "in antiquity"}), "check the date of this computer"),
+        (Event(seq=1, kind="note", time=float("nan"), data={"text": "never"}), "not what this hilbo writes"),
+        (Event(seq=1, kind="other", time=0.0, data={}), 'of the kind "other"'),
+        (Event(seq=1, kind="device", time=0.0, data={"condition": "ready"}), "trial"),
+        (Event(seq=1, kind="sent", time=0.0, data={"id": 1, "side": "a", "values": {"u": float("nan")}}), "float"),
+    ],
+)
+def test_what_no_reader_would_accept_is_not_written(tmp_path, event, why):
+    path = tmp_path / "log.jsonl"
+    with EventLog.create(path, STUDY.file, header()) as log:
+        before, state = path.read_bytes(), log.state
+        with pytest.raises(LogError, match=why):
+            log.append(event)
+        assert path.read_bytes() == before and log.state is state
+        log.append(Event(seq=1, kind="device", time=0.0, data=READY))
+    assert [event.kind for event in read_log(path)[1]] == ["device"]
 
 
 KILLED = """

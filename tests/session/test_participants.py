@@ -88,3 +88,10 @@ def test_an_id_that_differs_in_capitals_only_is_refused(tmp_path):
     with pytest.raises(InputError, match='participants "P01" and "p01" differ in capitals only'):
         add_person(path, person("p01"))
     assert list(read_people(path)) == ["P01"]
+
+
+def test_an_age_of_5000_digits_is_refused_in_a_sentence(tmp_path):
+    path = tmp_path / "participants.csv"
+    path.write_text(f"participant,consent_time,protocol_number,age\nP01,,,{'1' * 5000}\n")
+    with pytest.raises(InputError, match="it must be a whole number of years"):
+        read_people(path)

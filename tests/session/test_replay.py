@@ -67,7 +67,7 @@ FORGED = {
     "no data": lambda lines: first(lines, "answer").update(data=None),
     "no kind": lambda lines: first(lines, "answer").update(kind=None),
     "a kind that is none": lambda lines: first(lines, "answer").update(kind="dance"),
-    "a time that is none": lambda lines: first(lines, "answer").update(time=-1.0),
+    "a time that is none": lambda lines: first(lines, "answer").update(time=-1e11),
     "an answer without a trial": without("answer", "id"),
     "an answer to no trial": data("answer", id=999),
     "an answer that is none": data("answer", values={"class_a": "wonderful"}),

@@ -87,7 +87,7 @@ class StimulusCheck:
 
     def _middle(self, number: int) -> Showing:
         """The rendering in the middle of all ranges."""
-        middles = ((p, (p.low + p.high) / 2) for p in self._study.space.parameters)
+        middles = ((p, p.middle) for p in self._study.space.parameters)
         values = {p.name: float(round(middle)) if p.discrete else middle for p, middle in middles}
         return Showing(number + 1, 1, 0, "a", values, None)
 

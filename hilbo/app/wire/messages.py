@@ -9,6 +9,7 @@ import msgspec
 
 from hilbo.app.wire.lines import fields_of, number_or_name
 from hilbo.errors import InputError
+from hilbo.study.formats.parsing import UNREADABLE
 
 __all__ = ["LARGEST", "Answer", "Command", "Hello", "Join", "Press", "Report", "TooLargeError", "read"]
 
@@ -96,12 +97,12 @@ def read(kind: type, body: bytes, form: bool = False) -> Any:
     """The message in a request's body, JSON or a form (`lines`). Raises `InputError` with what is wrong with it."""
     if len(body) > LARGEST:
         raise TooLargeError(f"The message has more than {LARGEST} bytes, which are the most.")
+    fields = fields_of(body) if form else {}
+    if "values" in fields:
+        fields["values"] = {name: number_or_name(text) for name, text in fields["values"].items()}
     try:
         if form:
-            fields = fields_of(body)
-            if "values" in fields:
-                fields["values"] = {name: number_or_name(text) for name, text in fields["values"].items()}
             return msgspec.convert(fields, kind, strict=False)
         return msgspec.json.decode(body or b"{}", type=kind)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except UNREADABLE as error:
         raise InputError(f"The message is not understood: {error}.") from None

@@ -25,6 +25,7 @@ from typing import Literal, get_args
 
 from hilbo.errors import InputError
 from hilbo.study.disk.new_file import write_file
+from hilbo.study.formats.parsing import UNREADABLE
 
 __all__ = ["PAGES", "Gate", "Role", "lan_addresses"]
 
@@ -35,6 +36,7 @@ PAGES: tuple[Role, ...] = ("preparer", "participant", "experimenter")
 """The roles that have a page in a browser; the other is a program."""
 _BYTES = 24
 _LENGTH = 32  # characters of a key: base64 of _BYTES
+_DIGEST = re.compile("[0-9a-f]{64}")
 _KEYS = 4  # that a request may show, so that nobody has the server try thousands
 _SHOWN = re.compile(rf"earer {{1,8}}([\w-]{{{_LENGTH}}})(?![\w-])".encode())
 
@@ -128,12 +130,12 @@ def _kept(file: Path | None, what: str) -> dict[Role, str]:
     again."""
     try:
         content = json.loads(file.read_text(encoding="utf-8")) if file else {}
-    except (OSError, ValueError):
+    except (OSError, *UNREADABLE):
         return {}
     digests = content.get(what) if isinstance(content, dict) else None
     if not isinstance(digests, dict):
         return {}
-    return {role: digests[role] for role in get_args(Role) if isinstance(digests.get(role), str)}
+    return {role: digests[role] for role in get_args(Role) if _DIGEST.fullmatch(str(digests.get(role)))}
 
 
 def lan_addresses() -> list[str]:

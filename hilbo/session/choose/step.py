@@ -43,7 +43,7 @@ class Fitted(NamedTuple):
 
 def padding(study: Study, capacity: int) -> Float[np.ndarray, "capacity d"]:
     """What stands in rows without an answer, in physical units: the middle of the box."""
-    return np.tile([(p.low + p.high) / 2 for p in study.space.parameters], (capacity, 1))
+    return np.tile([p.middle for p in study.space.parameters], (capacity, 1))
 
 
 class Step:

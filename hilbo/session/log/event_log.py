@@ -13,9 +13,9 @@ from typing import Any
 
 from hilbo.errors import InputError
 from hilbo.session.log.header_check import check_new_header
-from hilbo.session.log.log_lines import event_line, header_line, is_unbegun, read_lines
+from hilbo.session.log.log_lines import event_line, event_of, header_line, is_unbegun, read_lines
 from hilbo.session.log.records import Event, Header
-from hilbo.session.log.replay import replayed
+from hilbo.session.log.replay import check_types, replayed
 from hilbo.session.log.rescue import fault_of, rescue
 from hilbo.session.log.state import LiveSession
 from hilbo.study.disk.lock import lock
@@ -112,8 +112,8 @@ class EventLog:
 
     def append(self, event: Event) -> LiveSession:
         """Put an event on the disk, and only then into the state, which is returned. Raises LogError."""
+        line = self._line(event)
         state = self.state.after(event)
-        line = event_line(event, self._lines[-1])
         self.check()
         self._write(line)
         self.check()
@@ -144,6 +144,15 @@ class EventLog:
             f"{self.path}: {self._fault}, and the session has stopped. {acknowledged}, in {self._copy}; end this"
             " server, compare the two files, give one of them the name of the log, and go on with --resume."
         )
+
+    def _line(self, event: Event) -> bytes:
+        """The event's line, which a reader would accept. Raises LogError."""
+        line = event_line(event, self._lines[-1])
+        try:
+            check_types(event_of(line, self.path))
+        except InputError as error:
+            raise LogError(f"{self.path}: nothing was written, because it could not be read again: {error}") from error
+        return line
 
     def _write(self, line):
         begun = time.perf_counter()

@@ -24,7 +24,7 @@ from hilbo.errors import InputError
 from hilbo.session.log.records import Event, Header
 from hilbo.study.formats.json_file import converted, decoded
 
-__all__ = ["FIRST", "WHY_CUT", "Read", "event_line", "header_line", "is_unbegun", "read_lines"]
+__all__ = ["FIRST", "WHY_CUT", "Read", "event_line", "event_of", "header_line", "is_unbegun", "read_lines"]
 
 WHY_CUT = (
     "where hilbo was killed while it wrote, nothing acknowledged is missing; where this is a copy, copy the log again."
@@ -64,6 +64,12 @@ def header_line(header: Header) -> bytes:
 def event_line(event: Event, previous: bytes) -> bytes:
     """The line of an event after the line `previous`."""
     return _line(event.seq, event.kind, event.time, event.data, previous)
+
+
+def event_of(line: bytes, place: str | os.PathLike) -> Event:
+    """The event of a line, as a reader gets it. Raises InputError."""
+    raw = decoded(line, _Line, str(place), _WHAT)
+    return Event(seq=raw.seq, kind=raw.kind, time=raw.time, data=raw.data)
 
 
 def is_unbegun(content: bytes) -> bool:

@@ -20,10 +20,10 @@ from hilbo.study.file.protocols import Ask, Show
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.json_file import check_values, converted
 
-__all__ = ["check_event", "replayed"]
+__all__ = ["check_event", "check_types", "replayed"]
 
 _Whole = Annotated[int, msgspec.Meta(ge=0, le=10**9)]
-_Time = Annotated[float, msgspec.Meta(ge=0, le=1e11)]
+_Time = Annotated[float, msgspec.Meta(ge=-6e10, le=1e11)]  # years 69 to 5138, which have a calendar date
 _Side = Literal["a", "b"]
 _WHAT = "is not what this hilbo writes"
 
@@ -145,18 +145,23 @@ def replayed(study: StudyFile, header: Header, events: Iterable[Event]) -> LiveS
 
 def check_event(state: LiveSession, event: Event) -> None:
     """Refuse an event that could not have been written in this state. Raises InputError."""
+    data = check_types(event)
     place = f"event {event.seq}"
-    if event.kind not in _KINDS:
-        raise InputError(f'{place} is of the kind "{event.kind}", which this hilbo does not know.')
-    kind, again = _KINDS[event.kind]
-    at = converted(event.time, _Time, place, "has no time of this hilbo")
-    data = converted(event.data, kind, place, _WHAT)
     try:
-        made = again(state, data, event.data, at)
+        made = _KINDS[event.kind][1](state, data, event.data, event.time)
     except (InputError, TypeError) as error:  # TypeError: a fact of the device called as an argument is
         raise InputError(f"{place} ({event.kind}) cannot have been written there: {error}") from error
     if made != event:
         raise InputError(f"{place} ({event.kind}) {_WHAT} there; restore the log from a copy.")
+
+
+def check_types(event: Event) -> object:
+    """The data of an event as the record of its kind. Raises InputError for a kind, a time or data that no log has."""
+    place = f"event {event.seq}"
+    if event.kind not in _KINDS:
+        raise InputError(f'{place} is of the kind "{event.kind}", which this hilbo does not know.')
+    converted(event.time, _Time, place, f"has no time of this hilbo; check the date of this computer, {event.time:g} s")
+    return converted(event.data, _KINDS[event.kind][0], place, _WHAT)
 
 
 def _without(raw: Mapping[str, Any], *names: str) -> dict[str, Any]:

@@ -110,7 +110,7 @@ def _check(row, place):
             raise InputError(
                 f'{place}: consent_time is "{row["consent_time"]}"; write it as 2026-05-04T10:15.'
             ) from None
-    if row.get("age") and not (row["age"].isdecimal() and int(row["age"]) < 130):
+    if row.get("age") and not (row["age"].isdecimal() and len(row["age"]) <= 3 and int(row["age"]) < 130):
         raise InputError(f'{place}: age is "{row["age"]}"; it must be a whole number of years, or empty.')
     if row.get("handedness", "") not in _HANDS:
         raise InputError(f'{place}: handedness is "{row["handedness"]}"; it must be right, left, both, or empty.')

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hilbo.study.disk.lock import JOURNAL, LOCK
+from hilbo.study.formats.parsing import UNREADABLE
 from hilbo.study.tables.parameter_sets import ROLES
 
 __all__ = ["Below", "called_after", "files_below", "is_closed", "read_text", "same_id", "spelled"]
@@ -171,7 +172,7 @@ def _in_fields(text: str, is_id: Callable[[str], bool], participant: str) -> str
 
     try:
         return next(named(json.loads(text), None), "")
-    except (ValueError, RecursionError):
+    except UNREADABLE:
         return participant
 
 

@@ -34,6 +34,7 @@ from hilbo.study.disk.lock import JOURNAL, locked_folder, withdrawal_above
 from hilbo.study.disk.new_file import UNFINISHED, remove_unfinished, rewrite_file, write_file
 from hilbo.study.disk.new_folder import LEFTOVER, recover
 from hilbo.study.file.plan_file import plan_in
+from hilbo.study.formats.parsing import UNREADABLE
 from hilbo.study.results.listing import LIST
 
 __all__ = ["Withdrawal", "delete_participant"]
@@ -124,7 +125,7 @@ def _journal(root: Path, participant: str) -> Withdrawal:
     except FileNotFoundError:
         before = Withdrawal(participant)
         _write_journal(root, before)
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (OSError, *UNREADABLE) as error:
         raise InputError(f"{path}: is no journal of a withdrawal that can be read ({error}); delete it.") from error
     if before.participant != participant:
         raise InputError(

@@ -40,6 +40,7 @@ def words(description: str, example: str) -> msgspec.Meta:
     return msgspec.Meta(description=description, examples=[example])
 
 
+_LONGEST = 200  # characters of a value in a sentence
 Number = Annotated[float, msgspec.Meta(description="a finite number")]
 Positive = Annotated[float, msgspec.Meta(gt=0, description="a number above 0")]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, description="a number, 0 or above")]
@@ -126,8 +127,9 @@ def check_table(raw: Any, path: str) -> Mapping[str, Any]:
 
 
 def shown(value: Any) -> str:
-    """A value as it stands in a sentence."""
-    return json.dumps(value, ensure_ascii=False, default=str)
+    """A value as it stands in a sentence, cut where it is long."""
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
 def prefix(source: str, line: int | None = None) -> str:

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from hilbo.errors import InputError
 from hilbo.study.file.protocols import Phase
 from hilbo.study.formats.json_file import decoded, digest_of, read_bytes
+from hilbo.study.formats.parsing import UNREADABLE
 
 __all__ = [
     "Block",
@@ -115,7 +116,7 @@ def plan_in(content: bytes) -> Plan | None:
     """The plan in the content of a file, whether its hash fits or not; None where there is none."""
     try:
         return msgspec.json.decode(content, type=Plan)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+    except UNREADABLE:
         return None
 
 

@@ -8,7 +8,6 @@ schemas, with defaults left out: spelling a default out changes nothing, the ord
 import hashlib
 import json
 import os
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -26,6 +25,7 @@ from hilbo.study.file.simulated_people import SimulationTable
 from hilbo.study.file.space_tables import box_of, check_together, of_material, read
 from hilbo.study.file.stimuli import StimulusTable
 from hilbo.study.file.trial_flags import TrialFlag
+from hilbo.study.formats.parsing import check_parsed, toml
 
 __all__ = ["StudyFile", "checked", "read_study"]
 
@@ -102,20 +102,14 @@ def read_study(path: str | os.PathLike, make: Callable[[StudyFile], _T]) -> _T:
         raise InputError(f"{source}: cannot be read ({error.strerror}), check the path.") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{source}: is not UTF-8 text, save it as UTF-8.") from error
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        reason, _, rest = str(error).partition(" (at line ")
-        line = rest.partition(",")[0]
-        place = f"{source}:{line or len(text.splitlines())}"
-        raise InputError(f"{place}: is not valid TOML ({reason}), fix that line.") from error
-    return checked(raw, source, make, text)
+    return checked(toml(text, source), source, make, text)
 
 
 def checked(raw: Mapping[str, Any], source: str, make: Callable[[StudyFile], _T], text: str = "") -> _T:
     """As `read_study`, from the parsed tables; `text`: the file's, in which the line of a mistake is looked for."""
     place = ""
     try:
+        check_parsed(raw)
         file = _file(raw, source)
         whole = make(file)
         for name in file.materials:

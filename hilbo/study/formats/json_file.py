@@ -16,6 +16,7 @@ import msgspec
 
 from hilbo.errors import InputError
 from hilbo.search.box import Parameter
+from hilbo.study.formats.parsing import UNREADABLE
 
 __all__ = ["Content", "check_values", "converted", "decoded", "digest_of", "read_bytes", "sealed", "unsealed"]
 
@@ -41,7 +42,7 @@ def decoded(content: bytes, kind: Any, source: str, what: str) -> Any:
     """
     try:
         return msgspec.json.decode(content, type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except UNREADABLE as error:
         raise InputError(f"{source}: {what} ({error}).") from error
 
 
@@ -49,7 +50,7 @@ def converted(raw: Any, kind: Any, source: str, what: str) -> Any:
     """As `decoded`, from plain Python data."""
     try:
         return msgspec.convert(raw, kind)
-    except (msgspec.ValidationError, RecursionError) as error:
+    except UNREADABLE as error:
         raise InputError(f"{source}: {what} ({error}).") from error
 
 

@@ -12,6 +12,7 @@ import msgspec
 
 from hilbo.study.disk.lock import LOCK
 from hilbo.study.disk.new_file import rewrite_file
+from hilbo.study.formats.parsing import UNREADABLE
 
 __all__ = ["LIST", "Listed", "digest", "list_files", "listed", "relist", "write_list"]
 
@@ -33,7 +34,7 @@ def listed(folder: Path) -> Listed:
     """The list of a folder; an empty one where there is none, or none that can be read."""
     try:
         entries = msgspec.json.decode((folder / LIST).read_bytes(), type=dict[str, str])
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+    except (OSError, *UNREADABLE):
         return Listed({})
     command, where = entries.pop(_COMMAND, ""), entries.pop(_WHERE, "")
     return Listed(entries, command, where)
