@@ -10,7 +10,7 @@ from typing import NamedTuple
 from hilbo.app.rehearsal.rehearsal import HILBO, fast_study
 from hilbo.app.rehearsal.robot import Client
 
-__all__ = ["Session", "session"]
+__all__ = ["Session", "session", "started"]
 
 DATA = Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml"
 
@@ -26,8 +26,8 @@ class Session(NamedTuple):
 
 
 @contextlib.contextmanager
-def session(folder: Path, *more: str, seconds: float = 0.05) -> Iterator[Session]:
-    """A session of short steps without consent, ended at the end."""
+def started(folder: Path, *more: str, seconds: float = 0.05) -> Iterator[tuple[subprocess.Popen, dict[str, str], Path]]:
+    """A session of short steps without consent, ended at the end: its process, unused links, the file of its words."""
     study = fast_study(DATA, folder / "study.toml", seconds, 2)
     given = ("--participant", "P01", "--logs", str(folder / "logs"), "--port", "0", "--gap", "0", "--dry-run", "--json")
     with open(folder / "words", "w", encoding="utf-8") as words:
@@ -39,13 +39,17 @@ def session(folder: Path, *more: str, seconds: float = 0.05) -> Iterator[Session
         line = process.stdout.readline()
         if not line:
             raise RuntimeError((folder / "words").read_text(encoding="utf-8"))
-        links = json.loads(line)
-        participant, experimenter = Client(links["participant"]), Client(links["experimenter"])
-        yield Session(
-            process, participant, experimenter, int(experimenter.address.rpartition(":")[2]), folder / "words"
-        )
+        yield process, json.loads(line), folder / "words"
     finally:
         process.terminate()
         process.wait(60)
         if process.stdout is not None:
             process.stdout.close()
+
+
+@contextlib.contextmanager
+def session(folder: Path, *more: str, seconds: float = 0.05) -> Iterator[Session]:
+    """A session as in `started`, with a program for each role."""
+    with started(folder, *more, seconds=seconds) as (process, links, words):
+        participant, experimenter = Client(links["participant"]), Client(links["experimenter"])
+        yield Session(process, participant, experimenter, int(experimenter.address.rpartition(":")[2]), words)

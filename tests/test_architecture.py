@@ -57,7 +57,7 @@ MAY_IMPORT = {
     "session.withdrawal": {"session.plan"},
     "simulation": {"session.choose", "session.plan"},
     "device": {"mechanics"},
-    "device.local": {"device"},
+    "device.local": {"device", "programs"},
     "hardware_bridge": {"device.local"},
     "identification": {"study.tables"},
     "identification.motor": {"hardware_bridge"},

@@ -3,12 +3,13 @@
 import contextlib
 import hashlib
 import os
-import stat
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
+
+from hilbo.programs.private import is_private
 
 __all__ = ["Entries", "Entry"]
 
@@ -37,7 +38,7 @@ class Entries:
         """Entry with this key; None if it is missing, damaged or not private to this user."""
         path = self._path(words)
         try:
-            if not _private(self.folder) or not _private(path):
+            if not is_private(self.folder) or not is_private(path):
                 self._remark(f"{path}: belongs to, or may be changed by, another user; it is not used.")
                 return None
             content = path.read_bytes()
@@ -60,7 +61,7 @@ class Entries:
         body = msgspec.msgpack.encode(entry)
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if not _private(self.folder):
+            if not is_private(self.folder):
                 self._remark(f"{self.folder}: belongs to, or may be changed by, another user; nothing is kept there.")
                 return
             # Not by hilbo.study.disk: what a power failure loses of a cache is made again, and is known by its digest.
@@ -98,14 +99,3 @@ class Entries:
     def _path(self, words: str) -> Path:
         """File of the entry with this key."""
         return self.folder / f"{hashlib.sha256(words.encode()).hexdigest()}{_SUFFIX}"
-
-
-def _private(path: Path) -> bool:
-    """Whether a path belongs to this user and nobody else may write to it.
-
-    On Windows only symbolic links are refused.
-    """
-    status = path.lstat()
-    if os.name == "nt":
-        return not stat.S_ISLNK(status.st_mode)
-    return status.st_uid == os.geteuid() and not status.st_mode & 0o022 and not stat.S_ISLNK(status.st_mode)

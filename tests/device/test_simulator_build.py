@@ -1,7 +1,9 @@
 """How the simulated device's program is made, and what is said where it cannot be."""
 
+import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from simulated import ENVIRONMENT, needs_device, own_cache  # noqa: F401
@@ -40,6 +42,36 @@ def test_sources_that_do_not_compile_are_one_sentence(monkeypatch, tmp_path):
     with pytest.raises(DeviceError, match=r"does not compile with .*: .*broken\.c"):
         simulator.built()
     assert not list(tmp_path.glob("hilbo/*/*"))
+
+
+@pytest.mark.parametrize("which", ["folder", "program"])
+@pytest.mark.parametrize("how", ["writable", "link", "another user's"])
+def test_a_build_that_others_may_change_is_not_run(monkeypatch, tmp_path, which, how):
+    folder = tmp_path / "hilbo" / "device-0"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(compiled, "hashlib", SimpleNamespace(sha256=lambda _: Zero()))
+    folder.mkdir(parents=True, mode=0o700)
+    (folder / "hilbo-device").touch(0o700)
+    assert simulator.built() == folder / "hilbo-device"
+    path = folder if which == "folder" else folder / "hilbo-device"
+    if how == "writable":
+        path.chmod(0o720)
+    elif how == "link":
+        path.symlink_to(path.rename(tmp_path / "elsewhere"))
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: 12345)
+    with pytest.raises(DeviceError, match="may be changed by, another user; delete it"):
+        simulator.built()
+
+
+class Zero:
+    """A digest of nothing, so that the place of a build is known."""
+
+    def update(self, _):
+        pass
+
+    def hexdigest(self):
+        return "0"
 
 
 @pytest.mark.deep

@@ -36,7 +36,7 @@ from hilbo.study.file.plan_file import Plan, plan_text
 
 __all__ = ["HILBO", "Decider", "example_sets", "fast_study", "rehearse", "server"]
 
-HILBO = [sys.executable, "-c", "from hilbo.cli.main import main; main()"]
+HILBO = [sys.executable, "-P", "-c", "from hilbo.cli.main import main; main()"]
 _STEPS = {
     "warm_up": ("reference", "a"),
     "optimisation": ("reference", "a"),

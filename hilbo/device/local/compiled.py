@@ -1,7 +1,8 @@
 """Compilation of the firmware's C sources for this computer, to programs and shared libraries.
 
 The sources are part of hilbo. They are compiled once with the available C compiler, into the user's cache folder; the
-cache key is a hash of sources, compiler and flags, so that no stale build is used.
+cache key is a hash of sources, compiler and flags, so that no stale build is used. A build that another user could have
+written is not used either.
 """
 
 import hashlib
@@ -15,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hilbo.device.failures import DeviceError
+from hilbo.programs.private import is_private
 
 __all__ = ["compiled"]
 
@@ -27,7 +29,8 @@ def compiled(name: str, what: str, parts: Sequence[str], sources: Sequence[str] 
     """Path of the program (or shared library) `name`, compiled if it is not in the cache.
 
     `what` names it in error messages. `parts`: the folders of its headers and sources. `sources`: patterns of the C
-    files, if not all of these folders. Raises `DeviceError` if it cannot be built, with what to install.
+    files, if not all of these folders. Raises `DeviceError` if it cannot be built, with what to install, or if another
+    user may change what is in the cache.
     """
     root, compiler = _sources(what), _compiler(what)
     files = [path for folder in parts for path in sorted((root / folder).glob("*.[ch]"))]
@@ -38,6 +41,8 @@ def compiled(name: str, what: str, parts: Sequence[str], sources: Sequence[str] 
     for path in files:
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     program = _cache() / f"device-{digest.hexdigest()[:16]}" / name
+    _check_private(program.parent, what)
+    _check_private(program, what)
     if not program.exists():
         patterns = sources or [f"{folder}/*.c" for folder in parts]
         inputs = [path.relative_to(root).as_posix() for name in patterns for path in sorted(root.glob(name))]
@@ -45,10 +50,20 @@ def compiled(name: str, what: str, parts: Sequence[str], sources: Sequence[str] 
     return program
 
 
+def _check_private(path: Path, what: str) -> None:
+    """Refuse what another user may have put into the cache. Raises `DeviceError`."""
+    if os.path.lexists(path) and not is_private(path):
+        raise DeviceError(
+            f"{path}: {what} is not run, since this belongs to, or may be changed by, another user; delete it, or set"
+            " XDG_CACHE_HOME to a folder of yours."
+        )
+
+
 def _build(program: Path, what: str, command: Sequence[str], root: Path) -> None:
     """Compile in a temporary folder and move the result to its place, so that concurrent builds do not interfere."""
     try:
-        program.parent.mkdir(parents=True, exist_ok=True)
+        program.parent.parent.mkdir(parents=True, exist_ok=True)
+        program.parent.mkdir(mode=0o700, exist_ok=True)
         folder = Path(tempfile.mkdtemp(prefix="build-", dir=program.parent))
     except OSError as error:
         raise DeviceError(
@@ -61,6 +76,7 @@ def _build(program: Path, what: str, command: Sequence[str], root: Path) -> None
         if done.returncode:
             first = next(iter(done.stderr.strip().splitlines()), "no reason given")
             raise DeviceError(f"{what.capitalize()} does not compile with {command[0]}: {first}")
+        made.chmod(0o700)
         made.replace(program)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
