@@ -188,6 +188,11 @@ def test_the_first_study_begins_as_its_page_says(tmp_path):
         assert made.section(step, tmp_path) in text, "run python docs/site/first_study.py"
 
 
+def test_the_data_dictionary_is_that_of_the_code():
+    page = script("columns").page()
+    assert (DOCS / "guides" / "columns.md").read_text(encoding="utf-8") == page, "run python docs/site/columns.py"
+
+
 def test_the_page_of_mistakes_says_what_hilbo_says():  # fits once, for what is said in Python: 2 s
     page = script("mistakes").page()
     assert (DOCS / "guides" / "mistakes.md").read_text(encoding="utf-8") == page, "run python docs/site/mistakes.py"

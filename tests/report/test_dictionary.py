@@ -17,7 +17,7 @@ def test_every_column_has_a_unit_and_a_meaning():
     shown = dictionary(tables, plain())
     assert len(shown) == sum(len(table.columns) for table in tables.values())
     assert (shown["meaning"].str.len() > 3).all() and set(shown["table"]) == {"comparison.csv", "confusion.csv"}
-    assert shown[shown["column"] == "close"]["meaning"].iloc[0] == 'in which the answer was "close"'
+    assert shown[shown["column"] == "close"]["meaning"].iloc[0] == 'in which the response was "close"'
 
 
 def test_what_may_end_an_interval_is_what_the_study_has():
@@ -26,9 +26,9 @@ def test_what_may_end_an_interval_is_what_the_study_has():
         return dictionary(tables, study)["meaning"].tolist()
 
     between = Study.from_dict(PLAIN | {"constraints": [{"terms": {"u": 10.0, "v": 1.0}, "most": 20.0}]})
-    assert said(plain())[0] == "what ends it there: another answer or the range"
-    assert said(between)[0] == "what ends it there: another answer, the range or a constraint"
-    assert "a constraint" in said(between)[1] and "a constraint" not in said(plain())[1]
+    assert said(plain())[0] == "reason of the lower end: another response or the range"
+    assert said(between)[0] == "reason of the lower end: another response, the range or a constraint"
+    assert "constraint boundary" in said(between)[1] and "constraint" not in said(plain())[1]
     assert said(Study.load("hilbo/data/paper.toml"))[0].endswith("the range or the passive boundary")
 
 

@@ -151,4 +151,4 @@ def test_an_answer_may_have_any_label(answers):
     assert counts[high].tolist() == [3, 0, 1] and counts[middle].tolist() == [0, 6, 0]
     study = Study.from_dict(PLAIN | {"study": {"name": "gelatin", "responses": list(answers)}})
     words = dictionary({"confusion": counts}, study).set_index("column")["meaning"]
-    assert words[high] == f'in which the answer was "{high}"' and words.iloc[0].startswith("set that was shown")
+    assert words[high] == f'in which the response was "{high}"' and words.iloc[0].startswith("set that was presented")

@@ -197,7 +197,7 @@ def test_the_table_of_comparisons_has_what_was_confirmed_of_either_side(tmp_path
     assert sets_table([state]).set_index("set_id").at["D", "u"] == SETS["D"]["u"]  # as it was planned
     psych_ds([state], tmp_path, STUDY.file)
     sidecar = (tmp_path / "data" / "study-plain_table-validation_data.json").read_text()
-    assert "What was confirmed as presented on side b, no unit" in sidecar
+    assert "value confirmed as presented on side b" in sidecar
 
 
 def test_confirmed_values_take_the_place_of_no_other_column():

@@ -3,16 +3,16 @@ are."""
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from hilbo.session.export.columns import column_words
 from hilbo.session.export.tables import presentations_table, sessions_table, sets_table, trials_table, validation_table
 from hilbo.session.log.log_files import log_name
 from hilbo.session.log.state import LiveSession
+from hilbo.study.file.columns import meanings
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.cell_text import check_text
 from hilbo.study.tables.trials import write_trials
@@ -40,8 +40,8 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: StudyFile) ->
     for kind, table in tables.items():
         if table.empty:
             continue
-        words = column_words(study, kind)
-        here = [_variable(str(column), words) for column in table.columns]
+        known = meanings(kind, study.space)
+        here = [_variable(str(column), *known[str(column)]) for column in table.columns]
         columns |= {variable["name"]: variable for variable in here if variable["name"] not in columns}
         written += _write(table, here, folder / "data", kind, study)
     path = folder / "dataset_description.json"
@@ -80,8 +80,9 @@ def _check_names(state: LiveSession) -> None:
         check_text(name, "the name of a set", place)
 
 
-def _variable(column: str, words: Mapping[str, str]) -> dict[str, str]:
-    return {"@type": "PropertyValue", "name": column, "description": words.get(column, column.replace("_", " "))}
+def _variable(column: str, unit: str, meaning: str) -> dict[str, str]:
+    variable = {"@type": "PropertyValue", "name": column, "description": meaning}
+    return variable | {"unitText": unit} if unit else variable
 
 
 def _json(content: Any) -> str:

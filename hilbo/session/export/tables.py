@@ -14,12 +14,12 @@ from typing import Any
 import pandas as pd
 
 from hilbo.errors import InputError
-from hilbo.session.export.columns import UNWRITTEN, presented_column
 from hilbo.session.log.event_log import read_session
 from hilbo.session.log.log_files import log_paths
 from hilbo.session.log.presented import in_words
 from hilbo.session.log.records import Trial
 from hilbo.session.log.state import LiveSession
+from hilbo.study.file.columns import UNWRITTEN, presented_column
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES, SAMPLES, flag_words
 from hilbo.study.formats.cell_text import runs_in_a_spreadsheet
