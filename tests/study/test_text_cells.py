@@ -18,8 +18,9 @@ from hilbo.study.cohort import read_trials
 from hilbo.study.tables.parameter_sets import read_sets
 from hilbo.study.tables.validation import read_validation
 
-FORMULAS = ("=1+1", "@SUM(A1)", "+cmd", "-cmd|' /C calc'!A1", "\t=1+1", "=HYPERLINK(A1)")
-PLAIN = ("-3", "+1.5e-3", "-", "a=1", "P01", "3 - 4")
+FORMULAS = ("=1+1", "@SUM(A1)", "+cmd", "-cmd|' /C calc'!A1", "\t=1+1", "=HYPERLINK(A1)", " =1+1")
+IN_ANOTHER_COUNTRY = ("a;=1+1", "a,@SUM(A1)", "a\t+cmd", 'a;"=1+1"', ";-cmd", "a;b;=1+1", "a\n=1+1")
+PLAIN = ("-3", "+1.5e-3", "-", "a=1", "P01", "3 - 4", "1,-2", "a; b, - c", "a;-")
 NO_IDS = (".", "..", "-x", "P 1", "../P1", "a/b", "é", "x" * 33, "=1+1")
 
 
@@ -72,7 +73,7 @@ def test_text_that_a_spreadsheet_would_run_is_refused(tmp_path, table, column):
     make, read = READ[table]
     for text in PLAIN:
         read(make(tmp_path / "good.csv", **{column: text}))
-    for text in FORMULAS:
+    for text in (*FORMULAS, *IN_ANOTHER_COUNTRY):
         path = make(tmp_path / "bad.csv", **{column: text})
         content = path.read_bytes()
         with pytest.raises(InputError, match="spreadsheet would run"):
@@ -119,9 +120,9 @@ def test_words_of_a_session_are_refused_where_they_are_said():
     state = driver.state
     for act in (actions.undo, actions.abort, actions.note):
         words = {"at": 1.0, ("text" if act is actions.note else "reason"): "=1+1"}
-        with pytest.raises(RefusedError, match="begins as a formula"):
+        with pytest.raises(RefusedError, match="would run as a formula"):
             act(state, **words)
-    with pytest.raises(RefusedError, match="begins as a formula"):
+    with pytest.raises(RefusedError, match="would run as a formula"):
         actions.void(state, 1, "@SUM(A1)", 1.0)
     assert actions.note(state, "3 = 3", 1.0).data["text"] == "3 = 3"
 

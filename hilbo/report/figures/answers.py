@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 
-from hilbo.report.figures.style import ORANGE
+from hilbo.report.figures.style import ORANGE, plain
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 
@@ -67,7 +67,7 @@ def answer_handles(study: Study, counts: Int[np.ndarray, " p"], *, discs: bool =
     for category, label in enumerate(study.responses):
         look = _look(study, category)
         marker = "o" if no_marks else look["marker"]
-        handles.append(_handle(label, marker=marker, markerfacecolor=look["facecolor"]))
+        handles.append(_handle(plain(label), marker=marker, markerfacecolor=look["facecolor"]))
     if len(several):
         low, high = several.min(), several.max()
         number = f"{low}\n" if low == high else f"{low}\nto {high} "

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import BLUE, ORANGE, RED, label_axes, new_figure, styled
+from hilbo.report.figures.style import BLUE, ORANGE, RED, label_axes, new_figure, score_label, styled
 from hilbo.study.analysis.effects import Effect
 from hilbo.study.config import Study
 
@@ -26,7 +26,7 @@ def effects_figure(study: Study, effects: Sequence[Effect], optimum: Float[np.nd
         axes.remove()
     for i, (axes, effect) in enumerate(zip(grid.ravel(), effects, strict=False)):
         label_axes(axes, study, i, i)
-        axes.set(yscale="linear", ylabel=f"{study.file.attribute} f" if i % across == 0 else "")
+        axes.set(yscale="linear", ylabel=score_label(study) if i % across == 0 else "")
         _draw(axes, effect, study.space.parameters[i].discrete, best[i])
     for axes in grid.ravel()[: len(effects)]:
         axes.autoscale(axis="y")

@@ -31,6 +31,8 @@ from hilbo.report.figures.style import (
     legend,
     level_words,
     new_figure,
+    plain,
+    score_label,
     star,
     styled,
     title,
@@ -128,7 +130,7 @@ def moved_optima(names: Sequence[str], moves: Float[ArrayLike, " M"], population
     axes.scatter(percent[order], rows, s=20, color=np.where(percent[order] < 100 * limit, BLUE, ORANGE), zorder=3)
     axes.axvline(100 * population_move, color=RED, label="population map")
     axes.axvline(100 * limit, color=GREY, linestyle="--", linewidth=1, label=f"flagged from {100 * limit:g} %")
-    axes.set_yticks(rows, [names[int(i)] for i in order], fontsize=7)
+    axes.set_yticks(rows, [plain(names[int(i)]) for i in order], fontsize=7)
     axes.set(xlabel="NRMSE between the optima (%)", xlim=(0, None), ylim=(-0.7, len(percent) - 0.3))
     legend(figure, axes.get_legend_handles_labels()[0])
     return figure
@@ -178,7 +180,7 @@ def map_panels(study: Study, grids):
     size = (ONE_COLUMN, 2.9) if len(grids) == 1 else (TWO_COLUMNS, 2.6)
     figure, ((*panels,),) = new_figure(*size, 1, len(grids), sharey=True, squeeze=False)
     scale = ScalarMappable(Normalize(low, high), "cividis")
-    bar = figure.colorbar(scale, ax=panels, label=f"{study.file.attribute} f", fraction=0.05, pad=0.02)
+    bar = figure.colorbar(scale, ax=panels, label=score_label(study), fraction=0.05, pad=0.02)
     few_ticks(bar.ax.yaxis, 5)
     for axes in panels:
         label_axes(axes, study, 0, 1)
@@ -257,7 +259,7 @@ def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.n
 def label_curve(axes, study: Study) -> None:
     """Axes of a map of one parameter."""
     label_axes(axes, study, 0, 0)
-    axes.set(yscale="linear", ylabel=f"{study.file.attribute} f")
+    axes.set(yscale="linear", ylabel=score_label(study))
 
 
 def draw_curve(axes, study: Study, curve: Sequence[np.ndarray], sd_label: str = "", label: str = "") -> None:

@@ -14,7 +14,7 @@ from hilbo import passivity
 from hilbo.identification.characterise import Characterisation
 from hilbo.identification.fitting import Fit, Test
 from hilbo.identification.memory_selection import LIMIT, Row
-from hilbo.report.figures.style import BLUE, GREEN, GREY, ORANGE, RED, TWO_COLUMNS, new_figure, styled
+from hilbo.report.figures.style import BLUE, GREEN, GREY, ORANGE, RED, TWO_COLUMNS, new_figure, plain, styled
 from hilbo.viscoelastic import FOSLS
 
 __all__ = ["bode_figure", "curves_figure", "memory_figure", "passive_set_figure", "passivity_figure", "predicted"]
@@ -59,7 +59,7 @@ def curves_figure(tests: Sequence[Test], result: Characterisation, unit: str = "
             upper.set(xscale="log", yscale="log")
         elif test.kind == "relaxation":
             upper.set(xscale="log", xlim=(test.time[1], test.time[-1]))
-        upper.set(title=test.kind, ylabel=_LABELS[test.kind][1].format(unit))
+        upper.set(title=test.kind, ylabel=_LABELS[test.kind][1].format(plain(unit)))
         lower.set(xlabel="time (s)", ylabel="measured - fit")
     figure.legend(*upper.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
     return figure

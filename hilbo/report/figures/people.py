@@ -7,7 +7,7 @@ import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import BLUE, GREY, ONE_COLUMN, RED, TWO_COLUMNS, legend, new_figure, styled
+from hilbo.report.figures.style import BLUE, GREY, ONE_COLUMN, RED, TWO_COLUMNS, legend, new_figure, plain, styled
 
 __all__ = ["people_figure", "predictive_check"]
 
@@ -46,7 +46,7 @@ def predictive_check(
     axes.bar(positions, 100 * observed, label="answers given", **look)
     axes.vlines(positions, low, high, color=RED, linewidth=2)
     axes.scatter(positions, middle, s=26, color=RED, zorder=3, label="would be given again")
-    axes.set_xticks(positions, list(responses))
+    axes.set_xticks(positions, [*map(plain, responses)])
     axes.set(ylabel="share of the answers (%)", ylim=(0, None))
     legend(figure, axes.get_legend_handles_labels()[0])
     return figure

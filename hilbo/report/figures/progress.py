@@ -17,6 +17,7 @@ from hilbo.report.figures.style import (
     few_ticks,
     legend,
     new_figure,
+    plain,
     styled,
 )
 from hilbo.search.apart import nrmse
@@ -52,7 +53,7 @@ def _top_answers(axes, study: Study, cohort: Cohort, trials: np.ndarray, xlabel:
     """Answers in the highest category so far: median and quartiles over participants."""
     top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
     band(axes, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
-    axes.set(xlabel=xlabel, ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
+    axes.set(xlabel=xlabel, ylabel=f'answers "{plain(study.responses[-1])}" so far', ylim=(0, None))
     axes.legend(frameon=False, loc="upper left")
     few_ticks(axes.yaxis, 5, integer=True)
     few_ticks(axes.xaxis, 6, integer=True)

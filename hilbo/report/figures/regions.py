@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from hilbo.report.figures.maps import plane
-from hilbo.report.figures.style import RED, TWO_COLUMNS, label_axes, legend, new_figure, star, styled, title
+from hilbo.report.figures.style import RED, TWO_COLUMNS, label_axes, legend, new_figure, plain, star, styled, title
 from hilbo.study.analysis.analysis import Reading
 from hilbo.study.analysis.tolerance import slice_through
 
@@ -29,7 +29,7 @@ def class_regions(readings: Mapping[str, Reading]) -> Figure:
     and with the third; of two parameters or one, the readings stand side by side. White: may not be rendered.
     """
     study = next(iter(readings.values())).study
-    d, labels = study.space.dim, study.responses
+    d, labels = study.space.dim, [*map(plain, study.responses)]
     pairs = [(0, 1), (0, 2)] if d > 2 else [(0, d - 1)]
     shades = ListedColormap(mpl.colormaps["cividis"](np.linspace(0.12, 1.0, len(labels))))
     rows, across = (len(readings), len(pairs)) if len(pairs) > 1 else (1, len(readings))

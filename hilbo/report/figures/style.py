@@ -28,6 +28,8 @@ __all__ = [
     "legend",
     "level_words",
     "new_figure",
+    "plain",
+    "score_label",
     "star",
     "styled",
     "title",
@@ -70,6 +72,16 @@ def legend(figure, handles) -> None:
     figure.legend(handles=handles, loc="outside upper center", ncols=across, frameon=False, fontsize=size)
 
 
+def plain(words: str) -> str:
+    """Words of a user as text of a figure: matplotlib reads what is between two dollars as a formula."""
+    return words.replace("$", r"\$")
+
+
+def score_label(study: Study) -> str:
+    """Label of axes and colour bars of the latent function."""
+    return f"{plain(study.file.attribute)} f"
+
+
 def title(axes, text: str) -> None:
     """The title of a panel."""
     axes.set_title(text, fontsize=STYLE["axes.titlesize"])
@@ -97,18 +109,18 @@ def _steps_on(axes, which, parameter) -> None:
     """The axis of a discrete parameter: half a step of margin at both ends, levels by their names."""
     getattr(axes, f"set_{which}lim")(parameter.low - 0.5 * (parameter.scale == "linear"), parameter.high + 0.5)
     if parameter.levels:
-        getattr(axes, f"set_{which}ticks")(range(len(parameter.levels)), parameter.levels)
+        getattr(axes, f"set_{which}ticks")(range(len(parameter.levels)), [*map(plain, parameter.levels)])
     elif parameter.scale == "linear":
         getattr(axes, f"{which}axis").get_major_locator().set_params(integer=True)
 
 
 def _name(name: str) -> str:
     symbols = {"alpha": "α", "K1": "$K_1$", "B1": "$B_1$"}
-    return symbols[name] if name in symbols else name.replace("_", " ")
+    return symbols[name] if name in symbols else plain(name.replace("_", " "))
 
 
 def _unit(unit):
-    return unit.replace("s^alpha", "s$^α$").replace(".", "·")
+    return plain(unit).replace("s^alpha", "s$^α$").replace(".", "·")
 
 
 def level_words(study: Study, index: int, unit_value: float) -> str:
@@ -116,7 +128,7 @@ def level_words(study: Study, index: int, unit_value: float) -> str:
     parameter = study.space.parameters[index]
     value = float(parameter.to_physical(np.asarray(float(unit_value))))
     words = parameter.words(value) if parameter.discrete else f"{value:.3g}"
-    return f"{_name(parameter.name)} = {words} {parameter.unit}".strip()
+    return f"{_name(parameter.name)} = {plain(words)} {plain(parameter.unit)}".strip()
 
 
 def star(axes, study: Study, x, pair: tuple[int, int] = (0, 1)) -> None:

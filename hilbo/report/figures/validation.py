@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import BLUE, GREY, ORANGE, RED, TWO_COLUMNS, new_figure, styled
+from hilbo.report.figures.style import BLUE, GREY, ORANGE, RED, TWO_COLUMNS, new_figure, plain, styled
 
 __all__ = ["aggregate_best_figure", "preference_rows", "validation_figure"]
 
@@ -89,7 +89,7 @@ def _rates(axes, rows):
         axes.hlines(places, rows["low"], rows["high"], color=BLUE, linewidth=1.5)
     axes.scatter(rows["rate"], places, s=36, color=ORANGE, edgecolor="black", linewidth=0.6, zorder=3, clip_on=False)
     labels = [
-        f"{a} over {b}\n{wins} of {wins + losses}" + (f", {ties} tied" if ties else "")
+        f"{plain(a)} over {plain(b)}\n{wins} of {wins + losses}" + (f", {ties} tied" if ties else "")
         for a, b, wins, losses, ties in zip(
             rows["set"], rows["over"], rows["wins"], rows["losses"], rows["ties"], strict=True
         )

@@ -307,7 +307,9 @@ def _event(state, kind, at, **data):
 def _text(text: str) -> str:
     """Words that will stand in a table as they are. Raises RefusedError for what a spreadsheet would run."""
     if runs_in_a_spreadsheet(text):
-        raise RefusedError("bad-answer", f'the text "{text[:40]}" begins as a formula does; begin it with a letter.')
+        raise RefusedError(
+            "bad-answer", f'the text "{text[:40]}" holds what a spreadsheet would run as a formula; write it otherwise.'
+        )
     return text
 
 

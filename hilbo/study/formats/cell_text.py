@@ -2,9 +2,10 @@
 
 Loads no JAX, no pandas.
 
-A spreadsheet runs a text cell that begins with =, @, + or - (OWASP, "CSV injection"). hilbo refuses such text where it
-comes in, and writes every text as it is: a mark put before it would be another text. Plain numbers and lone dashes are
-no such text.
+A spreadsheet runs a text cell that begins with =, @, + or - (OWASP, "CSV injection"). Where a cell ends depends on the
+country that it is set to: the text `a;=1+1` is two cells in half of Europe. hilbo refuses such text where it comes in,
+and writes every text as it is: a mark put before it would be another text. Plain numbers and lone dashes are no such
+text.
 """
 
 import re
@@ -28,10 +29,16 @@ __all__ = [
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 ID_WORDS = 'an id has up to 32 letters, digits, "_", "-", ".", begins with a letter or digit, and is nobody\'s name'
-FORMULA_WORDS = "which a spreadsheet would run as a formula; begin it with a letter or a digit"
+FORMULA_WORDS = (
+    "which a spreadsheet would run as a formula; begin it, and what follows a comma, semicolon or tab in it, with a"
+    " letter or a digit"
+)
 _NUMERAL = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?")
 _DASHES = "-+ \t\r\n"
 _BEGINS = ("=", "@", "+", "-", "\t", "\r", "\n", "＝", "＠", "＋", "－")  # noqa: RUF001 (some spreadsheets take these too)
+
+
+_ENDS = re.compile(r"[,;\t\r\n]")  # of cells: the separators of tables that hilbo reads, and ends of lines
 
 
 def is_id(participant: str) -> bool:
@@ -56,7 +63,13 @@ def but_for_case(names: Iterable[str]) -> str:
 
 
 def runs_in_a_spreadsheet(text: str) -> bool:
-    """Whether a spreadsheet may take this cell for a formula."""
+    """Whether a spreadsheet may take this cell, or what follows a separator in it, for a formula."""
+    return _begins_a_formula(text.lstrip(" ")) or any(
+        _begins_a_formula(part.lstrip('"')) for part in _ENDS.split(text)[1:]
+    )
+
+
+def _begins_a_formula(text: str) -> bool:
     return text.startswith(_BEGINS) and text.strip(_DASHES) != "" and _NUMERAL.fullmatch(text.strip()) is None
 
 
