@@ -234,11 +234,11 @@ def meanings(table: str, space: Box) -> dict[str, Meaning]:
     """The columns of a table (of `EXPORTED` or `REPORTED`) in a study with this search space. A table's own column
     comes before a parameter of that name."""
     units = {p.name: (p.unit, f", {p.range_words}" if p.levels else "") for p in space.parameters}
-    found = {"K0": _K0} | {name: (unit, f"value of the parameter{levels}") for name, (unit, levels) in units.items()}
+    columns = {"K0": _K0} | {name: (unit, f"value of the parameter{levels}") for name, (unit, levels) in units.items()}
     for side in "ab":
         for name, (unit, levels) in units.items():
-            found[presented_column(side, name)] = (unit, f"value confirmed as presented on side {side}{levels}")
+            columns[presented_column(side, name)] = (unit, f"value confirmed as presented on side {side}{levels}")
     mechanics = space.mechanics
     damped = mechanics is not None and mechanics.effective_damping is not None
     here = _by_the_study(bool(space.constraints), mechanics is not None, damped)
-    return found | _TABLES[table] | {name: here[name] for name in here if name in _TABLES[table]}
+    return columns | _TABLES[table] | {name: here[name] for name in here if name in _TABLES[table]}
