@@ -161,7 +161,8 @@ def _precision() -> Check:
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     size = sum(file.stat().st_size for file in Path(cache).glob("*")) / 1e6 if cache and Path(cache).is_dir() else 0.0
     dtype = jnp.zeros(()).dtype
-    words = f"{dtype}, {jax.devices()[0].platform}; compiled functions are kept in {cache} ({size:.0f} MB)"
+    kept = f"kept in {cache} ({size:.0f} MB)" if cache else "not kept"
+    words = f"{dtype}, {jax.devices()[0].platform}; compiled functions are {kept}"
     fix = "" if size else "the first session compiles for a minute; run `hilbo simulate --live` once before"
     fix = fix if dtype == jnp.float64 else "sessions are meant for float64"
     return _check("precision and cache", words, fix, "note")

@@ -85,8 +85,8 @@ def start(devices: int | None = None) -> None:
     jax.config.update("jax_enable_x64", True)
     if devices is not None:
         jax.config.update("jax_num_cpu_devices", devices)
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and (folder := _compiled_programs()) is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     if os.environ.get("HILBO_KEEP_PROGRAMS", "1") != "0":
@@ -96,6 +96,19 @@ def start(devices: int | None = None) -> None:
 def cache_folder() -> Path:
     """Where programs are kept: for this user, and for all studies."""
     return Path(os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")) / "hilbo"
+
+
+def _compiled_programs() -> Path | None:
+    """Folder in which JAX keeps compiled programs; None if another user may have put machine code there."""
+    from hilbo.programs.private import private_folder
+
+    folder = cache_folder() / "jax"
+    if private_folder(folder):
+        return folder
+    remark(
+        f"{folder}: belongs to, or may be changed by, another user; it is not used, delete it (hilbo cache --clear)."
+    )
+    return None
 
 
 def _keep_programs() -> None:
