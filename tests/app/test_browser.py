@@ -405,6 +405,20 @@ def test_a_tap_at_the_moment_when_answers_come_up_is_none(pages):
     until_logged(live, window, 2)
 
 
+def test_a_key_that_a_remote_desktop_doubles_is_marked(pages):
+    """Two keys of which the second comes when the next question has stood there for 310 ms."""
+    live, participant, experimenter = pages
+    window = participant.window
+    until_answered(participant, 1)  # by a person: at a time of their own
+    window.wait_for_selector("#options:visible")
+    for after in (900, 310, 900):
+        window.evaluate(f"laidOut = performance.now() - {after}; choose(0)")
+    until_logged(live, window, 2)
+    assert 0.31 <= live.events("answer")[1].data["browser"]["shortest_s"] < 0.5
+    until(experimenter, "view && view.table.rows.some((row) => row.cells[2].includes('answered after only 0.31'))")
+    assert "One question answered after only 0.31 s" in experimenter.inner_text("#log")
+
+
 @pytest.mark.parametrize("act", ["document.getElementById('go').click()", "document.dispatchEvent(SPACE)"])
 def test_a_second_tap_begins_nothing(pages, act):
     _, participant, _ = pages

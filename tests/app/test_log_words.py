@@ -68,6 +68,15 @@ def test_words_of_what_is_done(driver):
     assert said(driver, live.abort(driver.state, "", at)) == "The session is ended early."
 
 
+@pytest.mark.parametrize(("shortest", "mark"), [(0.32, "one question answered after only 0.32 s"), (0.5, "")])
+def test_an_answer_that_came_sooner_than_a_question_can_be_read_is_marked(driver, shortest, mark):
+    times = {"response_s": 1.25, "shortest_s": shortest}
+    answer = live.answer(driver.state, 3, "c", {"class_a": "close"}, 50.0, browser=times, felt=False)
+    more = f" {mark.capitalize()}." if mark else ""
+    assert said(driver, answer) == f"O1 is answered after 1.2 s: close.{more}"
+    assert [row["cells"][2] for row in table(driver.state)["rows"] if row["cells"][0] == "O1"] == [mark]
+
+
 def test_words_of_a_device_that_holds(driver):
     driver.log(live.present(driver.state, 3, 0, True, 50.0))
     held = live.device(driver.state, "hold", 51.0, trial=3, reason="the force was too large")

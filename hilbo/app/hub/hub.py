@@ -217,7 +217,8 @@ class Hub:
         """A participant's answer, accepted once; on the disk when this returns. Raises `NotNowError`."""
         self._check_page(page)
         trial, presentation = self._trial_of(message.trial)
-        browser = {} if message.response_ms is None else {"response_s": message.response_ms / 1000}
+        times = {"response_s": message.response_ms, "shortest_s": message.shortest_ms}
+        browser = {name: ms / 1000 for name, ms in times.items() if ms is not None}
         clicked = views.seconds_of(message.clicked)
         browser |= {} if clicked is None else {"clicked": clicked}
 

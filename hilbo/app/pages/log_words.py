@@ -1,5 +1,6 @@
 """The log's events as sentences, and the trials as rows, for the experimenter's page."""
 
+import math
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any
@@ -11,6 +12,7 @@ from hilbo.study.file.trial_flags import FLAGS, SAMPLES
 
 __all__ = ["line", "meant", "place_of", "sentence", "table"]
 
+_QUICK = 0.5  # s
 _SHOWN = {"reference": "the reference", "a": "rendering A", "b": "rendering B", "neutral": "nothing"}
 _WHO = {"stimulus": "The program that presents", "preparer": "The preparer"}
 _DEVICE = {"ready": "is ready", "running": "renders", "stopped": "is at rest", "hold": "holds", "estop": "was stopped"}
@@ -71,7 +73,16 @@ def _answered(_state, name, data):
     words = list(classes.values()) if len(values) == 1 else [f"{s.upper()} {c}" for s, c in classes.items()]
     words += [f"{values['preferred'].upper()} preferred"] if "preferred" in values else []
     after = "" if took is None else f" after {took:.1f} s"
-    return f"{name} is answered{after}: {', '.join(words)}.{_flags(data.get('telemetry'))}"
+    quick = _quick(data["browser"])
+    return f"{name} is answered{after}: {', '.join(words)}.{f' {quick.capitalize()}.' if quick else ''}" + _flags(
+        data.get("telemetry")
+    )
+
+
+def _quick(browser: Mapping[str, float]) -> str:
+    """That one of several questions was answered sooner than it can be read, as a doubled key does; else empty."""
+    shortest = browser.get("shortest_s", math.inf)
+    return f"one question answered after only {shortest:.2f} s" if shortest < _QUICK else ""
 
 
 def _flags(telemetry: Mapping[str, int] | None) -> str:
@@ -138,7 +149,8 @@ def _row(state: LiveSession, trial: Trial, chosen: bool) -> dict[str, Any]:
     discarded = trial.status not in ("pending", "answered")
     kind = "voided" if discarded else "now" if trial.status == "pending" else "repeated" if remark else ""
     flags = [name.replace("_", " ") for name in FLAGS if name in (trial.telemetry or {})]
-    remarks = "; ".join([remark] * bool(remark) + flags)
+    quick = _quick((trial.answered or {}).get("browser", {}))
+    remarks = "; ".join([text for text in (remark, quick) if text] + flags)
     row = {"kind": kind, "cells": [place_of(trial), answer, remarks, *shown]}
     voided = trial.status == "void" and trial.values is not None
     return row | ({"restore": meant(trial)} if voided and restorable(state, trial.id) else {})

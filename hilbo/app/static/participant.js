@@ -15,6 +15,7 @@ const server = requests(keyOf("participant"), page);
 
 let view = null;                     // what the server said last
 let answers = {}, asked = 0;         // of the question that is on the page
+let shortest = Infinity;             // ms from a question to its answer, the shortest of this trial
 let shownAt = 0, stepEnds = 0;       // performance.now()
 let laidOut = 0, goAt = 0;           // when the answers' buttons and Begin came up
 const WITHIN = 15000;                // ms until a request is given up
@@ -33,14 +34,16 @@ function receive(next) {
   const fresh = !view || !next.trial || next.trial.id !== trial;
   view = next;
   trial = next.trial ? next.trial.id : null;
-  if (fresh) { answers = {}; asked = 0; }
+  if (fresh) restart();
   if (next.step) stepEnds = performance.now() + 1000 * next.step.left;
   if (next.questions && !shownAt) shownAt = performance.now();
-  if (!next.questions) { shownAt = 0; answers = {}; asked = 0; }
+  if (!next.questions) { shownAt = 0; restart(); }
   document.documentElement.lang = next.lang || "en";
   document.title = words("page_title");
   draw();
 }
+
+function restart() { answers = {}; asked = 0; shortest = Infinity; }
 
 function kept() {
   try { return JSON.parse(localStorage.getItem(KEPT)); } catch { return null; }
@@ -108,10 +111,12 @@ function choose(i) {
   const q = view && !kept() && !over && view.questions && view.questions[asked];
   if (!q || !q.options[i]) return;
   answers[q.name] = q.options[i].value;
+  shortest = Math.min(shortest, Math.round(performance.now() - laidOut));
   asked += 1;
   if (asked < view.questions.length) { draw(); return; }
   localStorage.setItem(KEPT, JSON.stringify({
     trial, client, answers, clicked: new Date().toISOString(), response_ms: Math.round(performance.now() - shownAt),
+    ...(view.questions.length > 1 ? { shortest_ms: shortest } : {}),
   }));
   draw();
   hand();

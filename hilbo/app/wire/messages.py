@@ -39,13 +39,14 @@ class Join(_Message, frozen=True):
 
 class Answer(_Message, frozen=True):
     """All answers of one trial, question -> label. `clicked`: the browser's time, ISO 8601. `response_ms`: since the
-    questions could be answered."""
+    questions could be answered; `shortest_ms`: of several questions the shortest time from one to its answer."""
 
     trial: _Id
     client: Annotated[str, msgspec.Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.:-]+$")]
     answers: Annotated[dict[_Id, _Id], msgspec.Meta(min_length=1, max_length=8)]
     clicked: Annotated[str, msgspec.Meta(max_length=40)] = ""
     response_ms: _Milliseconds | None = None
+    shortest_ms: _Milliseconds | None = None
 
 
 class Press(_Message, frozen=True):

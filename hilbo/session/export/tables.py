@@ -116,6 +116,7 @@ def validation_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
                     | {"preferred": sets[values["preferred"]]}
                     | _confirmed(state.study, trial)
                     | _times(trial)
+                    | {"shortest_time": (trial.answered or {}).get("browser", {}).get("shortest_s")}
                     | _telemetry(trial)
                 )
     return _table(rows)
@@ -255,7 +256,7 @@ def _table(rows):
     table = pd.DataFrame(rows)
     if COLUMN_OF_SAMPLES in table:
         table[COLUMN_OF_SAMPLES] = table[COLUMN_OF_SAMPLES].astype("Int64")  # whole numbers, also where some lack
-    for column in ("material", "response_time", "unblinded", COLUMN, COLUMN_OF_SAMPLES):
+    for column in ("material", "response_time", "shortest_time", "unblinded", COLUMN, COLUMN_OF_SAMPLES):
         if column in table and table[column].isna().all():
             table = table.drop(columns=column)
     return table

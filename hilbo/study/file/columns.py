@@ -67,6 +67,12 @@ EXPORTED: dict[str, dict[str, Meaning]] = {
         "preferred": ("", "set that was preferred"),
     }
     | _TIMES
+    | {
+        "shortest_time": (
+            "s",
+            "shortest time from one of the questions to its response; below 0.5 perhaps a doubled key",
+        )
+    }
     | _DEVICE,
     "sets": {
         "set_id": ("", "name of the parameter set"),
