@@ -205,9 +205,9 @@ class Live:
             return self.experimenter.post(f"/api/experimenter/{name}", content)
         except urllib.error.HTTPError as error:
             sentence = error.read()
-            error.add_note(sentence.decode())
-            error.fp = io.BytesIO(sentence)
-            raise
+            again = urllib.error.HTTPError(error.url, error.code, error.msg, error.headers, io.BytesIO(sentence))
+            again.add_note(sentence.decode())
+            raise again from None
 
     def events(self, kind=None):
         """What is in the log, on the disk."""

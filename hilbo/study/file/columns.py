@@ -70,7 +70,7 @@ EXPORTED: dict[str, dict[str, Meaning]] = {
     | {
         "shortest_time": (
             "s",
-            "shortest time from one of the questions to its response; below 0.5 perhaps a doubled key",
+            "shortest time from a question to its response; below 0.5 perhaps a doubled key",
         )
     }
     | _DEVICE,
