@@ -15,7 +15,6 @@ from hilbo.session.choose.choice import Answers
 from hilbo.session.export.psych_ds import psych_ds
 from hilbo.session.export.tables import sets_table, trials_table, validation_table
 from hilbo.session.log import actions as live
-from hilbo.session.log.header_check import check_new_header
 from hilbo.session.log.presented import check_confirmed, counted
 from hilbo.session.log.records import RefusedError
 from hilbo.session.log.state import LiveSession
@@ -72,16 +71,9 @@ def test_on_a_logarithmic_scale_a_share_of_the_value_may_be_off(wanted, stated, 
             check_confirmed(study.file, asked_for, asked_for | {"f": wanted * factor})
 
 
-def test_a_log_of_before_is_read_with_tolerances_in_the_unit_and_none_is_begun():
-    study = Study.from_dict(LOGARITHMIC | {"stimulus": {"tolerance": {"f": 10.0}}})
-    asked_for = ASKED | {"f": 1.5}
-    check_confirmed(study.file, asked_for, ASKED | {"f": 11.0}, schema=2)
-    with pytest.raises(RefusedError, match="may be off by 10 Hz"):
-        check_confirmed(study.file, asked_for, ASKED | {"f": 12.0}, schema=2)
+def test_a_tolerance_that_is_no_share_is_refused_on_a_logarithmic_scale():
     with pytest.raises(InputError, match=r"tolerance.f is 10.0; on a logarithmic scale it is a share of the value"):
-        check_new_header(
-            study.file, msgspec.structs.replace(header(), study=study.file.hash, sets={}, blocks=header().blocks[1:])
-        )
+        Study.from_dict(LOGARITHMIC | {"stimulus": {"tolerance": {"f": 10.0}}})
 
 
 @pytest.mark.parametrize(

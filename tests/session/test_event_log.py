@@ -62,7 +62,7 @@ def test_a_log_reads_back_and_goes_on(tmp_path, driven):
         log.append(live.note(log.state, "again: ü, \n, \u2028", 1e9 + 0.1))
     assert read_log(path)[1][-1].data["text"] == "again: ü, \n, \u2028"
     first = path.read_bytes().split(b"\n")[0]
-    assert b'"schema":1,"study":"' + STUDY.file.hash.encode() in first
+    assert b'"schema":3,"study":"' + STUDY.file.hash.encode() in first
 
 
 @given(st.integers(0, 10**9))

@@ -195,13 +195,6 @@ def test_nobody_meets_the_points_of_an_earlier_session_or_of_another_material():
     assert planned_header(plan, STUDY.file, "P01").schema == header_for(STUDY.file, "P01", warm=False).schema == 3
 
 
-def test_sessions_of_schema_1_keep_their_seeds():
-    """The numbers are those of hilbo 0.2.0."""
-    for label in ("1", "2"):
-        assert choosing(label, "foam", "gel", schema=1) == {"foam": 1333066126, "gel": 509532018}
-        assert choosing(label, "foam", schema=1) == {"foam": 7} and choosing(label, None, schema=1) == {None: 7}
-
-
 def test_warm_up_renderings_are_feasible_spread_and_seeded():
     study = Study.load("hilbo/data/paper.toml")
     block, sets = warm_up(study.file, 5)

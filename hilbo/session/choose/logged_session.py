@@ -11,8 +11,6 @@ import os
 import time
 from pathlib import Path
 
-import msgspec
-
 from hilbo.errors import InputError
 from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.log import actions as live
@@ -37,7 +35,7 @@ class LoggedSession:
         """Begin a session, or go on with the one of this participant and label. Raises InputError."""
         path = Path(folder) / log_name(header)
         log = EventLog.resume(path, study.file) if begun(path) else EventLog.create(path, study.file, header)
-        if log.state.header != msgspec.structs.replace(header, schema=log.state.header.schema):
+        if log.state.header != header:
             log.close()
             raise InputError(f"{path}: was begun with another seed, plan or sets; give those, or another label.")
         return cls(log, LiveChooser(log.state))

@@ -85,7 +85,7 @@ def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event
         raise RefusedError("bad-answer", f'trial {trial} has no side "{side}".')
     if state.study.stimulus is not None:
         here = study_of(state.study, state.header.blocks[pending.block].material)
-        check_confirmed(here, pending.renderings[side], facts.get("values"), state.header.schema)
+        check_confirmed(here, pending.renderings[side], facts.get("values"))
     return _event(state, "sent", at, id=trial, side=side, **facts)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hilbo.session.log.header_check import SCHEMA, study_of
+from hilbo.session.log.header_check import study_of
 from hilbo.session.log.records import Header
 from hilbo.study.file.plan_file import Block, Planned
 from hilbo.study.file.protocols import protocol
@@ -32,17 +32,10 @@ def material_seed(header: Header, material: str | None) -> int:
     """The seed of what is chosen with a material, from the session's, the material's name and the session's label:
     points that came again in the same order would be recognised, and no order balances that. Without a material, and
     with the label "1", it is the session's own, as `hilbo.Session` has it.
-
-    Sessions of schema 1 keep theirs: of their materials several had seeds of their own, one had not.
     """
-    name = material or ""
-    if header.schema == 1:
-        own = len({block.material for block in header.blocks if not block.trials}) > 1
-    else:
-        name += "" if header.session == "1" else f"\n{header.session}"  # neither has a line's end in it
-        own = name != ""
+    name = (material or "") + ("" if header.session == "1" else f"\n{header.session}")  # neither has a line's end in it
     digest = hashlib.sha256(name.encode()).digest()
-    return seed_of(header.seed, int.from_bytes(digest[:4])) if own else header.seed
+    return seed_of(header.seed, int.from_bytes(digest[:4])) if name else header.seed
 
 
 def warm_up(study: StudyFile, seed: int, material: str | None = None) -> tuple[Block, dict[str, dict[str, float]]]:
@@ -91,7 +84,6 @@ def header_of(
 ) -> Header:
     """The header of a session of these blocks, with what it says of the study."""
     return Header(
-        schema=SCHEMA,
         study=study.hash,
         participant=participant,
         session=session,

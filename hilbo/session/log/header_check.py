@@ -3,19 +3,15 @@
 import math
 
 from hilbo.errors import InputError
-from hilbo.session.log.records import Header
+from hilbo.session.log.records import SCHEMA, Header
 from hilbo.study.file.plan_file import Block
 from hilbo.study.file.protocols import protocol
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.cell_text import check_id, check_text
 from hilbo.study.formats.json_file import check_values
 
-__all__ = ["SCHEMA", "check_header", "check_label", "check_new_header", "study_of"]
+__all__ = ["check_header", "check_label", "check_new_header", "study_of"]
 
-SCHEMA = 3  # of what is begun today
-_SCHEMAS = (1, 2, SCHEMA)
-# Sessions of 1 have other seeds (`hilbo.session.log.header.material_seed`), and up to 2 tolerances of a logarithmic
-# scale were in the parameter's unit (`hilbo.session.log.presented`).
 _MOST = 100_000  # trials of a block
 _LABEL = 64  # characters of a session's label, and of an id
 _DAY = 86_400.0  # s
@@ -27,10 +23,9 @@ def study_of(study: StudyFile, material: str | None) -> StudyFile:
 
 
 def check_header(study: StudyFile, header: Header) -> None:
-    """Refuse a header that no session of this study can have, of whatever version. Raises InputError."""
-    if header.schema not in _SCHEMAS:
-        known = ", ".join(map(str, _SCHEMAS))
-        raise InputError(f"the session's header is of schema {header.schema}; this hilbo knows {known}.")
+    """Refuse a header that no session of this study can have. Raises InputError."""
+    if header.schema != SCHEMA:
+        raise InputError(f"the session's header is of schema {header.schema}; this hilbo reads {SCHEMA}.")
     person = header.participant
     if not 0 < len(person) <= _LABEL or not person.isprintable() or any(mark in person for mark in "/\\"):
         raise InputError(f"the session's participant is \"{person[:_LABEL]}\", which is nobody's id.")
@@ -59,9 +54,6 @@ def check_new_header(study: StudyFile, header: Header) -> None:
     """Refuse a header with which no session may begin: one that `check_header` refuses, or with an id or words against
     the rules for them. Raises InputError."""
     check_header(study, header)
-    for here in {block.material: study_of(study, block.material) for block in header.blocks}.values():
-        if here.stimulus is not None:
-            here.stimulus.check_shares(here.space.parameters)
     check_id(header.participant, "the session's header")
     check_text(header.session, "the session's label")
     for number, block in enumerate(header.blocks, 1):

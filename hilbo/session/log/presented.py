@@ -9,18 +9,15 @@ parameter with steps the nearest one counts.
 import math
 from collections.abc import Mapping
 
-from hilbo.session.log.header_check import SCHEMA
 from hilbo.session.log.records import RefusedError
 from hilbo.study.file.reading import StudyFile
 
 __all__ = ["check_confirmed", "counted", "in_numbers", "in_words"]
 
 
-def check_confirmed(
-    study: StudyFile, asked: Mapping[str, float], values: Mapping[str, float] | None, schema: int = SCHEMA
-) -> None:
-    """Refuse what is no confirmation of the values asked for (physical units, by name). `schema`: of the session's
-    header. Raises RefusedError with the code "bad-answer" for what lacks a number, "off" for one that is too far off.
+def check_confirmed(study: StudyFile, asked: Mapping[str, float], values: Mapping[str, float] | None) -> None:
+    """Refuse what is no confirmation of the values asked for (physical units, by name). Raises RefusedError with the
+    code "bad-answer" for what lacks a number, "off" for one that is too far off.
     """
     names = study.space.names
     if values is None or set(values) != set(names):
@@ -28,8 +25,7 @@ def check_confirmed(
     assert study.stimulus is not None  # whoever asks has looked
     for parameter in study.space.parameters:
         value, wanted = values[parameter.name], asked[parameter.name]
-        stimulus = study.stimulus
-        most = stimulus.off_by(parameter, wanted) if schema > 2 else stimulus.off_by_before(parameter)
+        most = study.stimulus.off_by(parameter, wanted)
         if not math.isfinite(value):
             raise RefusedError("bad-answer", f"{parameter.name} is confirmed as {value}, which is no number.")
         if parameter.levels and value != wanted:

@@ -12,8 +12,10 @@ import msgspec
 from hilbo.errors import InputError
 from hilbo.study.file.plan_file import Block
 
-__all__ = ["Event", "Header", "Need", "RefusedError", "Status", "Trial"]
+__all__ = ["SCHEMA", "Event", "Header", "Need", "RefusedError", "Status", "Trial"]
 
+SCHEMA = 3
+"""Of a log's lines and header."""
 Status = Literal["pending", "answered", "undone", "void", "dropped", "left out"]
 
 
@@ -38,12 +40,11 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
 class Header(msgspec.Struct, frozen=True, kw_only=True):
     """All that decides a session in advance: the first line of its log.
 
-    `schema`: of 2 is what is begun today (`header_check.SCHEMA`); sessions of 1 choose with other seeds.
     `unblinded`: what showed its participant the parameters, "try" for `hilbo try`; "" where nothing did.
     `shown_to`: the roles that were shown the parameters of what is presented, where no device of ours does.
     """
 
-    schema: int = 1
+    schema: int = SCHEMA
     study: str
     participant: str
     session: str

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from hilbo.errors import InputError
 from hilbo.session.log.header import header_for, header_of, participant_seed, seed_of, warm_up
-from hilbo.session.log.header_check import SCHEMA, check_header
+from hilbo.session.log.header_check import check_header
 from hilbo.session.log.records import Header
 from hilbo.session.plan.counterbalance import block_size, comparisons, orders
 from hilbo.session.plan.set_codes import OWN, Sets, coded, set_codes
@@ -143,7 +143,7 @@ def planned_part(header: Header) -> PlannedSession:
 
 
 def _header_of_row(row: PlanRow) -> Header:
-    return Header(schema=SCHEMA, **msgspec.structs.asdict(row.header))
+    return Header(**msgspec.structs.asdict(row.header))
 
 
 def _header(study, person, session, seed, phase, materials, sets, source, codes) -> Header:

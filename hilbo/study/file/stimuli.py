@@ -39,6 +39,7 @@ class StimulusTable(Table, frozen=True):
     def check(self, parameters: Sequence[Parameter]) -> None:
         """Refuse tolerances of what is no parameter, and those that are none. Raises `InputError`."""
         names, levels = [p.name for p in parameters], [p.name for p in parameters if p.levels]
+        shares = [p.name for p in parameters if p.scale == "log"]
         for name, value in self.tolerance.items():
             path = f"stimulus.tolerance.{name}"
             if name not in names:
@@ -47,6 +48,11 @@ class StimulusTable(Table, frozen=True):
                 raise InputError(f"{path} is of levels, and another level is none that was asked for; leave it out.")
             if not 0 <= value < math.inf:
                 raise InputError(f"{path} is {shown(value)}; it must be a number, 0 or above.")
+            if name in shares and value >= 1:
+                raise InputError(
+                    f"{path} is {shown(value)}; on a logarithmic scale it is a share of the value and must be below 1,"
+                    " such as 0.01."
+                )
         for key, least in _PATIENCE.items() if self.by == "person" else ():
             if getattr(self, key) < least:
                 raise InputError(
@@ -64,17 +70,6 @@ class StimulusTable(Table, frozen=True):
         sees = self.by == "program" if self.experimenter_sees is None else self.experimenter_sees
         return (self.role, "experimenter") if sees else (self.role,)
 
-    def check_shares(self, parameters: Sequence[Parameter]) -> None:
-        """Refuse tolerances that are no shares, where shares are wanted; in earlier versions they were in the unit, and
-        sessions of those are still read. Raises `InputError`."""
-        for p in parameters:
-            share = self.tolerance_of(p)
-            if p.scale == "log" and share >= 1:
-                raise InputError(
-                    f"stimulus.tolerance.{p.name} is {shown(share)}; on a logarithmic scale it is a share of the value"
-                    " and must be below 1, such as 0.01."
-                )
-
     def tolerance_of(self, parameter: Parameter) -> float:
         """How far a confirmed value may be off: in the parameter's unit, on a logarithmic scale as a share of it."""
         if parameter.levels:
@@ -85,10 +80,6 @@ class StimulusTable(Table, frozen=True):
     def off_by(self, parameter: Parameter, wanted: float) -> float:
         """How far the confirmation of a value may be off, in the parameter's unit."""
         return self.tolerance_of(parameter) * (wanted if parameter.scale == "log" else 1.0)
-
-    def off_by_before(self, parameter: Parameter) -> float:
-        """The same in sessions whose header has a schema below 3: on every scale in the unit, as of a linear one."""
-        return self.tolerance.get(parameter.name, _EXACT * (parameter.high - parameter.low))
 
     def tolerance_words(self, parameter: Parameter) -> str:
         """`tolerance_of` in words, such as 0.5 deg, or 1 %."""

@@ -14,7 +14,7 @@ from hilbo.study.disk.lock import LOCK
 from hilbo.study.disk.new_file import rewrite_file
 from hilbo.study.formats.parsing import UNREADABLE
 
-__all__ = ["LIST", "Listed", "digest", "list_files", "listed", "relist", "write_list"]
+__all__ = ["LIST", "Listed", "digest", "list_files", "listed", "write_list"]
 
 LIST = ".hilbo.json"
 _COMMAND, _WHERE = "//command", "//folder"  # no file has such a name
@@ -44,19 +44,6 @@ def list_files(folder: Path, command: str = "", where: str = "") -> None:
     """Write the list of all files that are in a folder now."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in (LIST, LOCK))
     write_list(folder, Listed({path.relative_to(folder).as_posix(): digest(path) for path in files}, command, where))
-
-
-def relist(folder: Path, changed: set[Path]) -> None:
-    """Bring a folder's list up to date about files that hilbo changed or took away; of others it says what it said."""
-    known = listed(folder)
-    files = {}
-    for name, was in known.files.items():
-        path = folder / name
-        if path not in changed:
-            files[name] = was
-        elif path.is_file():
-            files[name] = digest(path)
-    write_list(folder, known._replace(files=files))
 
 
 def write_list(folder: Path, content: Listed) -> None:
