@@ -9,6 +9,7 @@ import contextlib
 import itertools
 import json
 import sys
+import time
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -116,6 +117,7 @@ def _serve(hub, place, served, as_json) -> None:
 
 def _started(hub, place, served, as_json) -> None:
     """Links on the terminal; with --json in one line on stdout, for programs."""
+    from hilbo.app.pages.pace import duration
     from hilbo.app.server import serve
 
     stimulus = hub.state.study.stimulus
@@ -124,6 +126,8 @@ def _started(hub, place, served, as_json) -> None:
     for note in hub.rig.notes:
         print(f"hilbo: {note}", file=sys.stderr)
     print(f"log:          {hub.log.path}" + (f"  ({hub.log.dropped})" if hub.log.dropped else ""), file=sys.stderr)
+    if hub.state.active is not None:
+        print(f"resumed:      {duration(time.time() - hub.state.active)} after its last activity", file=sys.stderr)
     for role, link in links.items():
         print(f"{role + ':':<13} {link}", file=sys.stderr)
     for role in ("preparer", "participant") if served.lan else ():

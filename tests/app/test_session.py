@@ -3,6 +3,8 @@
 import gc
 import json
 import threading
+import time
+from types import SimpleNamespace
 
 import pytest
 from live_server import PATIENCE, Live, check_blinding, listen, refused
@@ -212,6 +214,27 @@ def test_a_voided_answer_is_restored_from_its_row(tmp_path):
         live.command("restore", trial=1)
         assert live.hub.state.trials[0].status == "answered" and live.hub.state.skipped(0) == []
         assert not any("restore" in row for row in live.whole()["table"]["rows"])
+        live.replays()
+
+
+def test_the_page_says_how_long_a_pause_was_while_it_lasts_and_after_it(tmp_path, monkeypatch):
+    def rows(view):
+        return dict(view["trial"])
+
+    with Live(tmp_path) as live:
+        live.begin()
+        live.answer()
+        live.command("pause")
+        assert not {"Pauses", "Last activity"} & set(rows(live.whole()))
+        later = SimpleNamespace(**vars(time) | {"time": lambda: time.time() + 86_400.0})
+        for module in ("hub.hub", "pages.views"):
+            monkeypatch.setattr(f"hilbo.app.{module}.time", later)
+        assert rows(live.whole())["Last activity"].endswith(", 1 d ago")
+        live.command("resume")
+        seen = live.until(lambda view: "Pauses" in rows(view), live.whole)
+        assert rows(seen)["Pauses"] == "1, the last of 1 d before V2" and "Last activity" not in rows(seen)
+        assert any("A pause of 1 d. V2" in words for _, _, words in seen["log"])
+        assert seen["whole"]["pauses"][0]["trial"] == 2
         live.replays()
 
 

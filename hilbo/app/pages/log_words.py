@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any
 
+from hilbo.app.pages.pace import duration
 from hilbo.session.log.actions import restorable
 from hilbo.session.log.records import Event, Trial
 from hilbo.session.log.state import LiveSession
@@ -41,7 +42,8 @@ def sentence(state: LiveSession, event: Event) -> str:
     name = "" if trial is None else place_of(state.trial(trial))
     if event.kind == "repeat":
         return _repeated(state.trial(data["id"]), name, event.seq)
-    return _SENTENCES[event.kind](state, name, data)
+    pause = next((f"A pause of {duration(p.seconds)}. " for p in state.pauses if p.seq == event.seq), "")
+    return pause + _SENTENCES[event.kind](state, name, data)
 
 
 def _because(data: Mapping[str, Any]) -> str:

@@ -1,11 +1,21 @@
-"""How long a session will still take. Loads no JAX."""
+"""How long a session will still take, and durations in words. Loads no JAX."""
 
 import numpy as np
 
 from hilbo.session.log.state import LiveSession
 from hilbo.study.file.protocols import protocol
 
-__all__ = ["minutes_left"]
+__all__ = ["duration", "minutes_left"]
+
+
+def duration(seconds: float) -> str:
+    """A duration of `seconds` in words, in its two largest units: "2 d 3 h", "1 h 5 min", "7 min"; below 1 min in s."""
+    if seconds < 60.0:
+        return f"{seconds:.0f} s"
+    minutes = int(seconds / 60.0)
+    days, hours, minutes = minutes // 1440, minutes // 60 % 24, minutes % 60
+    parts = [(days, "d"), (hours, "h")] if days else [(hours, "h"), (minutes, "min")]
+    return " ".join(f"{count} {unit}" for count, unit in parts if count)
 
 
 def minutes_left(state: LiveSession) -> float:

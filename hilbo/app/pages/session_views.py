@@ -131,6 +131,7 @@ def experimenter_view(state: LiveSession) -> View:
         "notes": [{"time": at, "text": text} for at, text in state.notes],
         "began": state.began,
         "last": state.last,
+        "pauses": [pause._asdict() for pause in state.pauses],
         "participant": participant_view(state),
     }
 

@@ -11,10 +11,10 @@ from datetime import datetime
 
 from hilbo.app.interface import HubInterface
 from hilbo.app.pages.log_words import line, meant, place_of, table
-from hilbo.app.pages.pace import minutes_left
+from hilbo.app.pages.pace import duration, minutes_left
 from hilbo.app.pages.session_views import View, experimenter_view, participant_view
 from hilbo.session.log.records import Trial
-from hilbo.session.log.state import LiveSession
+from hilbo.session.log.state import PAUSE, LiveSession
 
 __all__ = ["choice_rows", "experimenter", "map_version", "participant", "place_of", "seconds_of", "trial_name"]
 
@@ -182,6 +182,7 @@ def _trial_rows(hub: HubInterface, trial: Trial | None) -> list[list[str]]:
     if state.screen not in ("done", "ended"):
         left = minutes_left(state)
         rows.append(["Time left", f"about {left:.0f} min" if left >= 1 else "below a minute"])
+    rows += _pause_rows(state)
     if trial is None:
         return rows
     for side, values in trial.renderings.items():
@@ -190,6 +191,19 @@ def _trial_rows(hub: HubInterface, trial: Trial | None) -> list[list[str]]:
     rows += choice_rows(trial.data.get("choice", {}))
     if hub.delays:
         rows.append([f"Answer to {hub.rig.title.lower()}", f"{1000 * hub.delays[-1]['total']:.0f} ms"])
+    return rows
+
+
+def _pause_rows(state: LiveSession) -> list[list[str]]:
+    """The pause that is going on, and those that have been."""
+    rows, away = [], 0.0 if state.active is None else time.time() - state.active
+    if away >= PAUSE and state.screen not in ("done", "ended"):
+        at = datetime.fromtimestamp(state.active or 0.0).strftime("%d %b %H:%M")
+        rows.append(["Last activity", f"{at}, {duration(away)} ago"])
+    if state.pauses:
+        last = state.pauses[-1]
+        words = f"{len(state.pauses)}, the last of {duration(last.seconds)} before {place_of(state.trial(last.trial))}"
+        rows.append(["Pauses", words])
     return rows
 
 

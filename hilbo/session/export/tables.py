@@ -188,13 +188,16 @@ def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
 
 
 def sessions_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """Every session, with the hash of the plan that it was held by; empty where it was held by none."""
+    """Every session, with the hash of the plan that it was held by (empty where it was held by none), and its
+    pauses."""
     rows = []
     for state in sessions:
         header = state.header
         phases = ", ".join(dict.fromkeys(block.phase for block in header.blocks))
         place = {"participant": header.participant, "session": header.session, "phases": phases}
-        rows.append(place | {"plan": _written(header.plan or ""), "seed": header.seed})
+        pauses = [pause.seconds for pause in state.pauses]
+        away = {"pauses": len(pauses), "longest_pause": max(pauses, default=0.0)}
+        rows.append(place | {"plan": _written(header.plan or ""), "seed": header.seed} | away)
     return pd.DataFrame(rows)
 
 

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import itemgetter
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from hilbo.errors import InputError
 from hilbo.session.log.records import Event, Header, Need, RefusedError, Trial
@@ -24,9 +24,21 @@ from hilbo.session.log.transitions import APPLY, STOPS, stop_key
 from hilbo.study.file.protocols import protocol
 from hilbo.study.file.reading import StudyFile
 
-__all__ = ["LiveSession", "Screen"]
+__all__ = ["PAUSE", "LiveSession", "Pause", "Screen"]
+
+PAUSE = 60.0  # s
+"""The shortest time that counts as a pause."""
 
 Screen = Literal["wait", "trial", "ready", "rest", "paused", "done", "ended"]
+
+
+class Pause(NamedTuple):
+    """A time of `seconds`, at least `PAUSE`, in which nothing was presented or answered, whatever its cause: a break, a
+    rest, a server that did not run. Event `seq`, of trial `trial`, ended it."""
+
+    seq: int
+    trial: int
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -46,6 +58,8 @@ class LiveSession:
     notes: tuple[tuple[float, str], ...] = ()
     began: float | None = None
     last: float | None = None
+    active: float | None = None  # the time of the last event of a presentation, or response
+    pauses: tuple[Pause, ...] = ()
 
     @classmethod
     def start(cls, study: StudyFile, header: Header) -> "LiveSession":
@@ -74,7 +88,17 @@ class LiveSession:
             raise InputError(f'event {event.seq} is of the kind "{event.kind}", which this hilbo does not know.')
         following = apply(self, event)
         began = event.time if self.began is None else self.began
-        return replace(following, seq=event.seq, began=began, last=event.time)
+        return replace(following, seq=event.seq, began=began, last=event.time, **self._activity(event))
+
+    def _activity(self, event: Event) -> dict[str, Any]:
+        """What an event of a presentation, or a response, changes: the last activity, and the pause before it."""
+        if event.kind not in ("stimulus", "answer"):
+            return {}
+        id = event.data["id"]
+        meanwhile = self.trial(id).on is not None if event.kind == "answer" else not event.data["on"]
+        away = 0.0 if self.active is None or meanwhile else event.time - self.active
+        ended = (Pause(event.seq, id, away),) if away >= PAUSE else ()
+        return {"active": event.time, "pauses": self.pauses + ended}
 
     # What follows from the state.
 

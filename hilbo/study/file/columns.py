@@ -99,6 +99,8 @@ EXPORTED: dict[str, dict[str, Meaning]] = {
         "phases": ("", "phases of the session, in order"),
         "plan": ("", "hash of the plan that the session was held by; empty where it was held by none"),
         "seed": ("", "seed of the session's choices"),
+        "pauses": ("pauses", "times of at least 60 s without a presentation or response, breaks and restarts included"),
+        "longest_pause": ("s", "duration of the longest of them; 0 where there was none"),
     },
 }
 """Table of an export (`hilbo.session.export`) -> column -> meaning."""
