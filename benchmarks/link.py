@@ -18,7 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from pages import put
 
-from hilbo.device import protocol
+from hilbo.device import messages
 from hilbo.hardware_bridge import Renderer
 
 SETS = (
@@ -55,7 +55,7 @@ def measure(minutes):
         before = device.status().tick
         conversation = converse(device, 60 * minutes)
         status, counts = device.status(), device.counts()
-        device.link.request(protocol.Stream(divisor=0, fields=0))
+        device.link.request(messages.Stream(divisor=0, fields=0))
         time.sleep(0.2)
         counts, link = device.counts(), device.link
         simulator, rate = device.simulator, device.device.tick_rate_Hz

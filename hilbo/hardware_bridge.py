@@ -20,12 +20,24 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, SupportsFloat
 
-from hilbo.device import protocol
 from hilbo.device.condition import Condition, condition_of
 from hilbo.device.failures import DeviceError, RefusalError
 from hilbo.device.handshake import greet, take_over
 from hilbo.device.link import Link
-from hilbo.device.messages import Status
+from hilbo.device.messages import (
+    Clear,
+    Drive,
+    Echo,
+    Estop,
+    GetLimits,
+    GetSet,
+    GetStatus,
+    Home,
+    Start,
+    Status,
+    Stop,
+    Stream,
+)
 from hilbo.device.parameter_sets import InForce, ParameterSet, in_force
 from hilbo.device.ports import BAUD, list_ports, open_port
 from hilbo.device.reasons import Capability, NackReason, State, held_because, meaning
@@ -122,9 +134,9 @@ class Renderer:
         """Stop the device and close the line. Raises `DeviceError` if the stop could not be sent."""
         try:
             if self._link.lost is None:
-                self._link.request(protocol.Stop())
+                self._link.request(Stop())
             else:
-                self._link.shout(protocol.Stop())
+                self._link.shout(Stop())
         finally:
             self._link.close()
             if self.simulator is not None:
@@ -174,12 +186,12 @@ class Renderer:
 
     def in_force(self) -> InForce | None:
         """Parameter set in force; None if there is none."""
-        return in_force(self._link.request(protocol.GetSet(bank=0)))
+        return in_force(self._link.request(GetSet(bank=0)))
 
     @property
     def delay(self) -> float:
         """Longest time (s) from the sample of a position to its force, for which the device checks its sets."""
-        return self._link.request(protocol.GetLimits()).delay_us * 1e-6
+        return self._link.request(GetLimits()).delay_us * 1e-6
 
     def home(self, position: SupportsFloat = 0.0) -> None:
         """Set the current position (mm) of the handle of a device without an absolute encoder.
@@ -187,7 +199,7 @@ class Renderer:
         Raises `DeviceError` while it moves, `RefusalError` for a position outside of its stroke.
         """
         place = {"stop": self._link.stops, "position_mm": float(position)}
-        self._link.request(protocol.Home(boot_id=self.device.boot_id, **place))
+        self._link.request(Home(boot_id=self.device.boot_id, **place))
 
     def start(self, *, stop: int | None = None, wait: SupportsFloat = 5.0) -> None:
         """Start rendering the set in force. Earlier telemetry is dropped.
@@ -207,7 +219,7 @@ class Renderer:
         give_up = self._link.now() + float(wait)
         while True:
             try:
-                self._link.request(protocol.Start(**order))
+                self._link.request(Start(**order))
                 return
             except DeviceError as error:
                 if not error.in_contact or self._link.now() > give_up:
@@ -216,11 +228,11 @@ class Renderer:
 
     def stop(self) -> int:
         """Ramp the force to zero, and return the device's count of stops, this one included."""
-        return self._link.request(protocol.Stop()).stops
+        return self._link.request(Stop()).stops
 
     def estop(self) -> None:
         """Emergency stop: force to zero at once, latched until `clear`."""
-        self._link.request(protocol.Estop())
+        self._link.request(Estop())
 
     def clear(self, *, stop: int | None = None) -> None:
         """Leave HOLD or ESTOP, once the reason is understood; waits for the force to decay to zero.
@@ -228,12 +240,12 @@ class Renderer:
         `stop`: count of the stop that is cleared (`link.stops`), by default the last one known. A later stop stays in
         effect and raises `DeviceError`.
         """
-        clear = protocol.Clear(boot_id=self.device.boot_id, stop=self._link.stops if stop is None else stop)
+        clear = Clear(boot_id=self.device.boot_id, stop=self._link.stops if stop is None else stop)
         retry_while_busy(self._link, self.device, clear, self._link.now() + _SINKS)
 
     def status(self) -> Status:
         """State and counters of the device."""
-        return self._link.request(protocol.GetStatus())
+        return self._link.request(GetStatus())
 
     def state(self) -> State:
         """State of the device."""
@@ -241,16 +253,16 @@ class Renderer:
 
     def condition(self) -> Condition:
         """Homing, hardware stop, delay, and continuous force of the motor."""
-        return condition_of(self.status(), self._link.request(protocol.GetLimits()))
+        return condition_of(self.status(), self._link.request(GetLimits()))
 
     def limits(self) -> dict[str, tuple[float, float]]:
         """Ranges that the device accepts: lowest and highest K0, K1 (N/mm), B1 (N·s^α/mm) and alpha."""
-        limits = self._link.request(protocol.GetLimits())
+        limits = self._link.request(GetLimits())
         return {n: (getattr(limits, f"{n}_low"), getattr(limits, f"{n}_high")) for n in ("K0", "K1", "B1", "alpha")}
 
     def echo(self, data: bytes) -> bytes:
         """Send bytes to the device and return its echo."""
-        return self._link.request(protocol.Echo(data=data)).data
+        return self._link.request(Echo(data=data)).data
 
     def stream(self, divisor: int = 1, *, sensed: bool | None = None) -> int:
         """Switch on telemetry of every `divisor`-th tick, or fewer if the line is too slow; 0 switches it off.
@@ -259,12 +271,12 @@ class Renderer:
         """
         fields = int(bool(self.can & Capability.FORCE_SENSOR) if sensed is None else sensed)
         try:
-            self._link.request(protocol.Stream(divisor=divisor, fields=fields))
+            self._link.request(Stream(divisor=divisor, fields=fields))
         except RefusalError as error:
             if error.nack.reason != NackReason.LINE_TOO_SLOW:
                 raise
             divisor = int(error.nack.limit)
-            self._link.request(protocol.Stream(divisor=divisor, fields=fields))
+            self._link.request(Stream(divisor=divisor, fields=fields))
         self.divisor = divisor
         return divisor
 
@@ -296,9 +308,7 @@ class Renderer:
         numbers = {"offset": float(offset), "amplitude": float(amplitude)}
         order = {"boot_id": self.device.boot_id, "stop": self._link.stops if stop is None else stop}
         self._link.heartbeat()
-        self._link.request(
-            protocol.Drive(mode=int(mode == "position"), shape=_SHAPES[shape], **numbers, **ticks, **order)
-        )
+        self._link.request(Drive(mode=int(mode == "position"), shape=_SHAPES[shape], **numbers, **ticks, **order))
 
     def _ticks(self, what: str, seconds: SupportsFloat) -> int:
         """Convert a time (s) to ticks. Raises `InputError` for one that does not fit the message; `what` names it."""

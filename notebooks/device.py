@@ -13,7 +13,7 @@ import os
 
 import numpy as np
 
-from hilbo.device.protocol import SampleFlag
+from hilbo.device.reasons import SampleFlag
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import Renderer
 from hilbo.viscoelastic import FOSLS

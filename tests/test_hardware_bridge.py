@@ -15,10 +15,11 @@ import pytest
 from peer import Peer
 
 from hilbo import hardware_bridge
-from hilbo.device import protocol
+from hilbo.device import messages, reasons
 from hilbo.device.link import Link
+from hilbo.device.messages import Sample
 from hilbo.device.ports import SocketPort
-from hilbo.device.protocol import NackReason, Sample
+from hilbo.device.reasons import NackReason
 from hilbo.device.telemetry import TelemetryBuffer
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, RefusalError, Renderer
@@ -39,9 +40,9 @@ def test_a_set_is_staged_committed_and_read_back():
         assert (confirmed.set_id, confirmed.memory, confirmed.length) == (1, "short", 101)
         assert float(np.float32(5.58)) == confirmed.K1
         device.start()
-        assert device.state() == protocol.State.RUNNING
-    assert peer.state == protocol.State.STOPPED
-    assert peer.done[protocol.Stop] == 1
+        assert device.state() == reasons.State.RUNNING
+    assert peer.state == reasons.State.STOPPED
+    assert peer.done[messages.Stop] == 1
 
 
 def test_a_set_that_is_in_force_is_not_sent_again():
@@ -49,9 +50,9 @@ def test_a_set_that_is_in_force_is_not_sent_again():
     with peer.open(**PATIENT) as device:
         first = device.send(**A)
         assert device.send(**A) == first
-        assert peer.done[protocol.SetParams] == 1
+        assert peer.done[messages.SetParams] == 1
         assert device.send(**(A | {"K1": 5.5})).set_id == 2
-        assert peer.done[protocol.SetParams] == 2
+        assert peer.done[messages.SetParams] == 2
 
 
 def test_full_memory_sends_its_exponentials():
@@ -59,7 +60,7 @@ def test_full_memory_sends_its_exponentials():
     with peer.open(**PATIENT) as device:
         confirmed = device.send(K0=0.4, K1=1.2, B1=3.0, alpha=0.35, memory="full", states=10)
         assert (confirmed.memory, confirmed.length) == ("full", 10)
-        assert peer.done[protocol.SetStates] == 2
+        assert peer.done[messages.SetStates] == 2
         for wrong in ({"states": 9}, {"alpha": 1.0}, {"memory": "long"}):
             with pytest.raises(InputError):
                 device.send(**({"K0": 0.4, "K1": 1.2, "B1": 3.0, "alpha": 0.35, "memory": "full"} | wrong))
@@ -81,18 +82,18 @@ def test_numbers_that_fit_no_wire_are_not_sent(wrong, words):
         with pytest.raises(InputError) as error:
             device.send(**(A | wrong))
         assert words in str(error.value)
-        assert peer.done[protocol.SetParams] == 0
+        assert peer.done[messages.SetParams] == 0
 
 
 def test_a_refusal_is_one_sentence_with_its_numbers():
     peer = Peer()
     with peer.open(**PATIENT) as device:
-        peer.refuse[protocol.SetParams] = {"reason": NackReason.NOT_PASSIVE, "value": 1.25, "limit": 0.95}
+        peer.refuse[messages.SetParams] = {"reason": NackReason.NOT_PASSIVE, "value": 1.25, "limit": 0.95}
         with pytest.raises(RefusalError, match=r"needs 1.25 N.s/m of damping and the device has 0.95") as error:
             device.send(**A)
         assert error.value.nack.reason == NackReason.NOT_PASSIVE
-        peer.refuse[protocol.Start] = {"reason": NackReason.STATE, "value": 4.0}
-        del peer.refuse[protocol.SetParams]
+        peer.refuse[messages.Start] = {"reason": NackReason.STATE, "value": 4.0}
+        del peer.refuse[messages.SetParams]
         device.send(**A)
         with pytest.raises(DeviceError, match="START is refused while the device is HOLD; find out why"):
             device.start()
@@ -101,10 +102,10 @@ def test_a_refusal_is_one_sentence_with_its_numbers():
 def test_commit_waits_until_the_history_is_warm():
     peer = Peer()
     with peer.open(**PATIENT) as device:
-        peer.refuse[protocol.Commit] = {"reason": NackReason.NOT_READY, "ticks": 5, "times": 4}
+        peer.refuse[messages.Commit] = {"reason": NackReason.NOT_READY, "ticks": 5, "times": 4}
         assert device.send(**A).set_id == 1
         assert peer.refuse == {}
-        peer.refuse[protocol.Commit] = {"reason": NackReason.NOT_READY, "ticks": 5}
+        peer.refuse[messages.Commit] = {"reason": NackReason.NOT_READY, "ticks": 5}
         with pytest.raises(DeviceError, match="needs 5 more ticks"):
             device.send(**(A | {"K1": 5.0}), wait=0.1)
 
@@ -123,7 +124,7 @@ def test_a_lost_answer_costs_a_retry_and_nothing_is_done_twice():
     with peer.open(patience=0.2, tries=100) as device:
         peer.swallow = 2
         device.send(**A)
-        assert peer.done[protocol.SetParams] == 1
+        assert peer.done[messages.SetParams] == 1
         assert device.link.retries >= 2
 
 
@@ -158,7 +159,7 @@ def test_garbage_is_survived():
         for _ in range(20):
             peer.socket.sendall(rng.bytes(200))
         peer.socket.sendall(b"\0")
-        peer.say(protocol.Stop(), seq=device.link._seq)  # a host's message is nothing a device says
+        peer.say(messages.Stop(), seq=device.link._seq)  # a host's message is nothing a device says
         assert device.echo(b"x" * 64) == b"x" * 64
         assert device.link.dropped > 0
 
@@ -185,7 +186,7 @@ def test_no_heartbeat_before_the_boot_id_is_known():
 )
 def test_another_version_is_refused_by_the_device(reason, words):
     peer = Peer()
-    peer.refuse[protocol.Hello] = {"reason": reason, "limit": 3.0}
+    peer.refuse[messages.Hello] = {"reason": reason, "limit": 3.0}
     with pytest.raises(DeviceError, match=words):
         peer.open(**PATIENT)
 
@@ -204,27 +205,27 @@ def test_a_study_that_counts_on_more_damping_is_refused():
         Peer().open(damping=0.9501, **PATIENT)
 
 
-@pytest.mark.parametrize("kind", [protocol.SetParams, protocol.Commit, protocol.GetSet, protocol.Start])
+@pytest.mark.parametrize("kind", [messages.SetParams, messages.Commit, messages.GetSet, messages.Start])
 def test_a_device_that_restarts_is_not_started_again(kind):
     peer = Peer()
     with peer.open(**PATIENT) as device:
         peer.restart_at = kind
         with pytest.raises(DeviceError, match="the device has restarted; it is stopped and knows no set"):
             send_and_start(device)
-        assert peer.state == protocol.State.STOPPED
+        assert peer.state == reasons.State.STOPPED
         with pytest.raises(DeviceError, match="restarted"):
             device.start()
         assert device.reconnect() is False
-        assert peer.state == protocol.State.STOPPED and peer.active is None
+        assert peer.state == reasons.State.STOPPED and peer.active is None
         device.send(**A)
         device.start()
-        assert peer.state == protocol.State.RUNNING
+        assert peer.state == reasons.State.RUNNING
 
 
 def test_a_notice_tells_of_a_restart_too():
     peer = Peer()
     with peer.open(**PATIENT) as device:
-        peer.say(protocol.Notice(tick=1, boot_id=555, state=0, reason=8, stops=0))
+        peer.say(messages.Notice(tick=1, boot_id=555, state=0, reason=8, stops=0))
         device.status()
         assert device.events() == ["tick 1: STOPPED, it has just started"]
         with pytest.raises(DeviceError, match="restarted"):
@@ -255,26 +256,26 @@ def test_whoever_comes_second_stops_what_runs():
     first.start()
     first.link.close()  # as if killed: no STOP
     with peer.open(**PATIENT) as device:
-        assert peer.state == protocol.State.STOPPED
+        assert peer.state == reasons.State.STOPPED
         assert device.notes == ["The device was RUNNING for an earlier host; it has been stopped."]
         assert device.in_force().set_id == 1
 
 
 def test_a_device_in_hold_says_why():
     peer = Peer()
-    peer.state = protocol.State.ESTOP
+    peer.state = reasons.State.ESTOP
     with peer.open(**PATIENT) as device:
         assert "The device is in ESTOP" in device.notes[0]
         device.clear()
-        assert peer.done[protocol.Clear] == 1
+        assert peer.done[messages.Clear] == 1
 
 
 def test_a_hold_whose_force_still_sinks_is_cleared_as_soon_as_it_is_gone():
     peer = Peer()
     with peer.open(**PATIENT) as device:
-        peer.refuse[protocol.Clear] = {"reason": NackReason.BUSY, "ticks": 20, "times": 2}
+        peer.refuse[messages.Clear] = {"reason": NackReason.BUSY, "ticks": 20, "times": 2}
         device.clear()
-        assert peer.done[protocol.Clear] == 3
+        assert peer.done[messages.Clear] == 3
 
 
 def test_an_error_in_the_block_is_not_hidden_by_a_dead_line():
@@ -291,15 +292,15 @@ def test_an_error_in_the_block_is_not_hidden_by_a_dead_line():
 
 def test_a_slow_line_gets_the_telemetry_it_carries():
     peer = Peer()
-    peer.refuse[protocol.Stream] = {"reason": NackReason.LINE_TOO_SLOW, "limit": 4.0}
+    peer.refuse[messages.Stream] = {"reason": NackReason.LINE_TOO_SLOW, "limit": 4.0}
     with pytest.raises(RefusalError, match="every 4th tick is the most it carries"):
         peer.open(**PATIENT)
-    assert peer.done[protocol.Stream] == 2
+    assert peer.done[messages.Stream] == 2
 
 
 def frame(tick, divisor=1, lost=0, count=3, fields=0):
     samples = tuple(Sample(100 + i, 256, 0.5, 0.25 if fields else None) for i in range(count))
-    return protocol.Telemetry(tick=tick, divisor=divisor, fields=fields, lost=lost, samples=samples)
+    return messages.Telemetry(tick=tick, divisor=divisor, fields=fields, lost=lost, samples=samples)
 
 
 def test_telemetry_arrives_in_columns():
@@ -399,8 +400,8 @@ def test_a_start_without_an_answer_is_followed_by_a_stop(lost):
     if lost:
         peer.socket.shutdown(socket.SHUT_WR)
     with pytest.raises(DeviceError):
-        device.link.request(protocol.Start(set_id=1, crc=0, boot_id=device.device.boot_id, stop=0))
-    while not peer.done[protocol.Stop]:
+        device.link.request(messages.Start(set_id=1, crc=0, boot_id=device.device.boot_id, stop=0))
+    while not peer.done[messages.Stop]:
         time.sleep(0.005)
     with contextlib.suppress(DeviceError):
         device.close()

@@ -8,11 +8,10 @@ import struct
 import time
 from typing import SupportsFloat
 
-from hilbo.device import protocol
 from hilbo.device.failures import DeviceError
 from hilbo.device.heartbeat import BEAT
 from hilbo.device.link import Link
-from hilbo.device.messages import HelloReply
+from hilbo.device.messages import SCHEMA, VERSION, GetLimits, GetStatus, Hello, HelloReply, Stop
 from hilbo.device.reasons import State, held_because, meaning
 from hilbo.errors import InputError
 
@@ -32,15 +31,15 @@ def greet(link: Link, damping: SupportsFloat | None, delay: SupportsFloat | None
     give_up = time.monotonic() + _BOOT
     while True:
         try:
-            device = link.request(protocol.Hello())
+            device = link.request(Hello())
             break
         except DeviceError as error:
             if error.nack is not None or link.lost or time.monotonic() > give_up:
                 raise
-    if (device.version, device.schema) != (protocol.VERSION, protocol.SCHEMA):
+    if (device.version, device.schema) != (VERSION, SCHEMA):
         raise DeviceError(
             f"{link.name}: the device speaks version {device.version} of the protocol, schema {device.schema:08x}, and"
-            f" this hilbo version {protocol.VERSION}, schema {protocol.SCHEMA:08x}; install the one that belongs to it."
+            f" this hilbo version {VERSION}, schema {SCHEMA:08x}; install the one that belongs to it."
         )
     silence = device.watchdog_ticks / device.tick_rate_Hz
     if silence < _BEATS * BEAT:
@@ -67,7 +66,7 @@ def _check_delay(link: Link, delay: float) -> None:
     """
     if not 0.0 <= delay < math.inf:
         raise InputError(f"The delay that the study counts on is {delay}; give a number from 0, in s.")
-    own = link.request(protocol.GetLimits()).delay_us
+    own = link.request(GetLimits()).delay_us
     if own > round(delay * 1e6):
         raise InputError(
             f"{link.name}: the study counts on a delay of at most {delay:g} s and the device checks its sets for"
@@ -78,16 +77,16 @@ def _check_delay(link: Link, delay: float) -> None:
 def take_over(link: Link, device: HelloReply) -> list[str]:
     """Stop the device if it still moves, and begin the heartbeats. Returns notes to report."""
     notes = []
-    status = link.request(protocol.GetStatus())
+    status = link.request(GetStatus())
     if status.state in (State.RUNNING, State.DRIVING, State.STOPPING):
         notes.append(f"The device was {meaning(State, status.state)} for an earlier host; it has been stopped.")
-        link.request(protocol.Stop())
+        link.request(Stop())
         give_up = link.now() + _STOPPING
         while status.state in (State.RUNNING, State.DRIVING, State.STOPPING):
             if link.now() > give_up:
                 raise DeviceError(f"{link.name}: the device does not stop; switch off its motor.")
             link.pause(0.01)
-            status = link.request(protocol.GetStatus())
+            status = link.request(GetStatus())
     if status.state in (State.HOLD, State.ESTOP):
         why = held_because(status.hold_reason)
         notes.append(f"The device is in {meaning(State, status.state)}: {why}; clear it before the next start.")

@@ -20,21 +20,45 @@ from hilbo.device.arrivals import Arrivals
 from hilbo.device.failures import DeviceError
 from hilbo.device.frames import Receiver, WireError
 from hilbo.device.heartbeat import BEAT, Heard, HelperHeart, ThreadHeart, heart_for
-from hilbo.device.messages import Ack, HelloReply, Message, Nack, Notice, Pulse, Status, Telemetry, code_of, name_of
+from hilbo.device.messages import (
+    Ack,
+    Drive,
+    Echo,
+    EchoReply,
+    Estop,
+    GetLimits,
+    GetSet,
+    GetStatus,
+    Heartbeat,
+    Hello,
+    HelloReply,
+    Limits,
+    Message,
+    Nack,
+    Notice,
+    Pulse,
+    Set,
+    Start,
+    Status,
+    Stop,
+    Telemetry,
+    code_of,
+    name_of,
+)
 from hilbo.device.reasons import NackReason
 from hilbo.errors import InputError
 
 __all__ = ["Link"]
 
 _ANSWER = {
-    protocol.Hello: protocol.HelloReply,
-    protocol.GetStatus: Status,
-    protocol.GetSet: protocol.Set,
-    protocol.GetLimits: protocol.Limits,
-    protocol.Echo: protocol.EchoReply,
+    Hello: HelloReply,
+    GetStatus: Status,
+    GetSet: Set,
+    GetLimits: Limits,
+    Echo: EchoReply,
 }
-_URGENT = frozenset({code_of(protocol.Stop), code_of(protocol.Estop)})
-_ALWAYS = (protocol.Hello, protocol.GetStatus, protocol.Stop, protocol.Estop)  # allowed for a restarted device too
+_URGENT = frozenset({code_of(Stop), code_of(Estop)})
+_ALWAYS = (Hello, GetStatus, Stop, Estop)  # allowed for a restarted device too
 
 
 class Link:
@@ -95,10 +119,10 @@ class Link:
         Raises `RefusalError` for refused numbers, `InputError` for numbers that do not fit the message, else
         `DeviceError`.
         """
-        if isinstance(message, protocol.Estop) and not self.lost:
+        if isinstance(message, Estop) and not self.lost:
             self._hush(True)  # if every ESTOP is lost, the device's watchdog ends its force
             self.shout(message)
-        if isinstance(message, protocol.Stop | protocol.Estop) and self.lost:
+        if isinstance(message, Stop | Estop) and self.lost:
             raise DeviceError(failures.urgent(self.lost, name_of(type(message)), self.shout(message)))
         with self._asking:
             if (self.restarted or self.faint) and not self.lost and not isinstance(message, _ALWAYS):
@@ -114,12 +138,12 @@ class Link:
                 if answer is None:
                     raise DeviceError(self._unanswered(kind))
             except BaseException:
-                if kind in (protocol.Start, protocol.Drive):
-                    self.shout(protocol.Stop())  # the device may be moving
+                if kind in (Start, Drive):
+                    self.shout(Stop())  # the device may be moving
                 raise
         if isinstance(answer, Nack):
             raise self._refusal(answer, name_of(kind))
-        if kind is protocol.Estop:
+        if kind is Estop:
             self._hush(False)
         return answer
 
@@ -225,7 +249,7 @@ class Link:
     def heartbeat(self) -> None:
         """Send one heartbeat now, unless the device is unknown or an ESTOP waits for its answer."""
         if self.boot_id is not None and not self._quiet:
-            self.write(protocol.encode(protocol.Heartbeat(boot_id=self.boot_id, tick=self.heard.tick), 0))
+            self.write(protocol.encode(Heartbeat(boot_id=self.boot_id, tick=self.heard.tick), 0))
 
     def _hush(self, quiet: bool) -> None:
         """Pause the heartbeats at once, or resume them."""
@@ -257,7 +281,7 @@ class Link:
             self.heartbeat()
             self._ticks(count)
             self._passed += count
-            self.request(protocol.GetStatus())
+            self.request(GetStatus())
 
     def close(self) -> None:
         """End the heartbeats and the reading thread, and close the port."""

@@ -1,8 +1,8 @@
 """Wire protocol of the device: conversion between messages and bytes, as specified in firmware/PROTOCOL.md.
 
 Nothing here does I/O. `encode` converts a message to the bytes of a frame, `Receiver` extracts frames from bytes and
-counts damaged ones, `decode` converts a frame to a message. The names of `messages`, `frames` and `reasons` are
-re-exported here. Numbers are rounded to binary32 when they are packed.
+counts damaged ones (`frames`), `decode` converts a frame to a message. Numbers are rounded to binary32 when they are
+packed.
 """
 
 import re
@@ -11,110 +11,22 @@ from collections.abc import Iterator
 from dataclasses import fields
 from typing import NamedTuple, get_args, get_type_hints
 
-from hilbo.device.frames import PAYLOAD, Frame, Receiver, WireError, closed, opened
+from hilbo.device.frames import PAYLOAD, Frame, WireError, closed, opened
 from hilbo.device.messages import (
     MESSAGES,
-    SCHEMA,
     VERSION,
-    Abort,
-    Ack,
-    Clear,
-    Commit,
-    Drive,
     Echo,
     EchoReply,
-    Estop,
     Exponential,
-    GetLimits,
-    GetSet,
-    GetStatus,
-    Heartbeat,
-    Hello,
-    HelloReply,
-    Home,
-    Limits,
     Message,
-    Nack,
-    Notice,
-    Pulse,
     Sample,
-    Set,
-    SetParams,
     SetStates,
-    Start,
-    Status,
-    Stop,
-    Stream,
     Telemetry,
     code_of,
     name_of,
 )
-from hilbo.device.reasons import (
-    Capability,
-    DeviceFlag,
-    HoldReason,
-    Memory,
-    NackReason,
-    SampleFlag,
-    Staging,
-    State,
-    sentence,
-)
 
-__all__ = [
-    "MESSAGES",
-    "SCHEMA",
-    "VERSION",
-    "Abort",
-    "Ack",
-    "Capability",
-    "Clear",
-    "Commit",
-    "DeviceFlag",
-    "Drive",
-    "Echo",
-    "EchoReply",
-    "Estop",
-    "Exponential",
-    "Frame",
-    "GetLimits",
-    "GetSet",
-    "GetStatus",
-    "Heartbeat",
-    "Hello",
-    "HelloReply",
-    "HoldReason",
-    "Home",
-    "Limits",
-    "Memory",
-    "Message",
-    "Nack",
-    "NackReason",
-    "Notice",
-    "Pulse",
-    "Receiver",
-    "Sample",
-    "SampleFlag",
-    "Set",
-    "SetParams",
-    "SetStates",
-    "Staging",
-    "Start",
-    "State",
-    "Status",
-    "Stop",
-    "Stream",
-    "Telemetry",
-    "WireError",
-    "code_of",
-    "decode",
-    "encode",
-    "frames_in",
-    "name_of",
-    "payload_of",
-    "schema_text",
-    "sentence",
-]
+__all__ = ["decode", "encode", "frames_in", "payload_of", "schema_text"]
 
 _CODES = {"u8": "B", "u16": "H", "u32": "I", "i16": "h", "f32": "f"}
 

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from hilbo.device import protocol
 from hilbo.device.failures import DeviceError
 from hilbo.device.link import Link
-from hilbo.device.messages import Ack, HelloReply, Message, SetParams, SetStates, Status
+from hilbo.device.messages import Ack, Commit, GetSet, GetStatus, HelloReply, Message, SetParams, SetStates, Status
 from hilbo.device.parameter_sets import InForce, crc_of, differences, in_force
 from hilbo.device.reasons import NackReason
 
@@ -22,14 +21,14 @@ def put_in_force(link: Link, device: HelloReply, wanted: Sequence[SetParams | Se
     `wanted`: messages of a `ParameterSet`, numbered here. A set that is already in force is not sent again. `wait` (s):
     timeout for the device to fill the set's history.
     """
-    status: Status = link.request(protocol.GetStatus())
+    status: Status = link.request(GetStatus())
     messages = [replace(message, set_id=status.active_id) for message in wanted]
     if status.active_id == 0 or crc_of(messages) != status.active_crc:
         set_id = max(status.active_id, status.staged_id) % 0xFFFF + 1
         messages = [replace(message, set_id=set_id) for message in wanted]
         give_up = link.now() + wait
         _stage(link, device, messages, give_up)
-        commit = protocol.Commit(set_id=set_id, crc=crc_of(messages), boot_id=device.boot_id)
+        commit = Commit(set_id=set_id, crc=crc_of(messages), boot_id=device.boot_id)
         retry_while_busy(link, device, commit, give_up)
     return _confirmed(link, messages)
 
@@ -58,7 +57,7 @@ def retry_while_busy(link: Link, device: HelloReply, message: Message, give_up: 
 
 def _confirmed(link: Link, messages: Sequence[SetParams | SetStates]) -> InForce:
     """Read back the set in force. Raises `DeviceError` if it is not the one that was sent."""
-    reply = link.request(protocol.GetSet(bank=0))
+    reply = link.request(GetSet(bank=0))
     wrong, reported = differences(messages, reply), in_force(reply)
     if wrong or reported is None:
         raise DeviceError(

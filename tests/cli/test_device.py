@@ -17,7 +17,7 @@ from commands import run
 from simulated import ENVIRONMENT, needs_device, own_cache  # noqa: F401
 
 from hilbo.cli.device.screen import trace
-from hilbo.device import protocol
+from hilbo.device import messages
 from hilbo.device.local.simulator import Simulator
 from hilbo.study.tables.parameter_sets import read_sets
 
@@ -357,5 +357,5 @@ def test_a_trace_shows_the_largest_excursions():
 def test_every_message_of_a_capture_can_be_shown():
     from hilbo.cli.device.output import _field
 
-    assert _field((protocol.Exponential(0.5, 0.25),)) == "(0.5,0.25)"
+    assert _field((messages.Exponential(0.5, 0.25),)) == "(0.5,0.25)"
     assert _field(b"\x01\xff") == "01ff"

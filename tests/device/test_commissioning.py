@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from simulated import needs_device, own_cache  # noqa: F401
 
-from hilbo.device import protocol
+from hilbo.device import messages
 from hilbo.device.link import Link
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, Renderer, State
@@ -241,7 +241,7 @@ def test_ctrl_c_within_a_nudge_stops_the_device(monkeypatch):
     monkeypatch.setattr(commissioning, "wait_until", lambda *arguments: next(waits)(*arguments))
     with pytest.raises(KeyboardInterrupt), device:
         find_signs(device, quiet, Bounds())
-    assert protocol.Drive in requests and requests[-1] is protocol.Stop
+    assert messages.Drive in requests and requests[-1] is messages.Stop
 
 
 def test_a_device_that_measures_no_delay_is_refused(monkeypatch):

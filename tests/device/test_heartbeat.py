@@ -15,10 +15,11 @@ from peer import Peer
 from simulated import ENVIRONMENT
 
 from hilbo.device import heartbeat
+from hilbo.device.frames import Receiver
 from hilbo.device.heartbeat import HelperHeart, ThreadHeart, keep_beating
 from hilbo.device.messages import MESSAGES, Heartbeat, Notice, Pulse, Telemetry, code_of
 from hilbo.device.ports import SocketPort
-from hilbo.device.protocol import Receiver, encode
+from hilbo.device.protocol import encode
 from hilbo.hardware_bridge import DeviceError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="only POSIX shares an open line with another process")

@@ -7,7 +7,7 @@ import time
 import pytest
 from peer import Peer
 
-from hilbo.device import protocol
+from hilbo.device import messages
 from hilbo.device.heartbeat import BEAT
 from hilbo.hardware_bridge import DeviceError
 
@@ -44,7 +44,7 @@ def silent(peer) -> bool:
 def test_a_line_that_is_lost_one_way_hears_no_heartbeat_but_stop_and_estop(half):
     peer, device = half
     assert silent(peer)
-    for ask, message in ((device.stop, protocol.Stop), (device.estop, protocol.Estop)):
+    for ask, message in ((device.stop, messages.Stop), (device.estop, messages.Estop)):
         before = peer.done[message]
         with pytest.raises(DeviceError, match="was written all the same; no answer can come: see that the device"):
             ask()
@@ -54,7 +54,7 @@ def test_a_line_that_is_lost_one_way_hears_no_heartbeat_but_stop_and_estop(half)
 def test_closing_a_lost_line_still_says_stop(half):
     peer, device = half
     device.close()
-    until(lambda: peer.done[protocol.Stop])
+    until(lambda: peer.done[messages.Stop])
 
 
 def test_a_capture_that_fails_ends_the_heartbeats(capsys):
@@ -72,7 +72,7 @@ def test_a_capture_that_fails_ends_the_heartbeats(capsys):
         assert silent(peer)
         with pytest.raises(DeviceError, match="ESTOP was written"):
             device.estop()
-        until(lambda: peer.done[protocol.Estop])
+        until(lambda: peer.done[messages.Estop])
     assert capsys.readouterr().err == ""
 
 
@@ -86,7 +86,7 @@ def test_estop_waits_for_no_other_request():
         begun = time.monotonic()
         stopping = threading.Thread(target=device.estop)
         stopping.start()
-        until(lambda: peer.done[protocol.Estop])
+        until(lambda: peer.done[messages.Estop])
         assert asking.is_alive(), time.monotonic() - begun  # it waits 0.4 s for its answer
         stopping.join()
         asking.join()

@@ -13,8 +13,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilbo.device import frames, protocol, reasons
-from hilbo.device.frames import LONGEST, opened
-from hilbo.device.protocol import MESSAGES, Exponential, Frame, Receiver, Sample, WireError, decode, encode, name_of
+from hilbo.device.frames import LONGEST, Frame, Receiver, WireError, opened
+from hilbo.device.messages import (
+    MESSAGES,
+    SCHEMA,
+    Clear,
+    Drive,
+    Echo,
+    EchoReply,
+    Exponential,
+    Sample,
+    SetParams,
+    SetStates,
+    Start,
+    Stop,
+    Telemetry,
+    code_of,
+    name_of,
+)
+from hilbo.device.protocol import decode, encode
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "firmware" / "PROTOCOL.md").read_text(encoding="utf-8")
@@ -34,13 +51,13 @@ def messages(draw):
     kind = draw(st.sampled_from(list(MESSAGES.values())))
     words = protocol._wire(kind)
     values = {name: draw(NUMBERS[word]) for name, word in words.items() if word in NUMBERS and name != "reserved"}
-    if kind in (protocol.Echo, protocol.EchoReply):
+    if kind in (Echo, EchoReply):
         values["data"] = draw(st.binary(max_size=64))
-    if kind is protocol.SetStates:
+    if kind is SetStates:
         pair = st.builds(Exponential, NUMBERS["f32"], NUMBERS["f32"])
         values["states"] = tuple(draw(st.lists(pair, max_size=7)))
         values["count"] = len(values["states"])
-    if kind is protocol.Telemetry:
+    if kind is Telemetry:
         sensed = NUMBERS["f32"] if values["fields"] & 1 else st.none()
         sample = st.builds(Sample, st.integers(-(2**15), 2**15 - 1), NUMBERS["u16"], NUMBERS["f32"], sensed)
         values["samples"] = tuple(draw(st.lists(sample, max_size=4 if values["fields"] & 1 else 7)))
@@ -50,7 +67,7 @@ def messages(draw):
 def test_the_schema_is_the_documents():
     block = re.search(r"```schema\n(.*?)```", DOCUMENT, re.DOTALL)[1]
     assert protocol.schema_text() == block
-    assert zlib.crc32(block.encode()) == protocol.SCHEMA
+    assert zlib.crc32(block.encode()) == SCHEMA
 
 
 def test_the_numbers_with_names_are_the_documents():
@@ -76,7 +93,7 @@ def test_a_message_comes_back(drawn, seq):
     frame = encode(message, seq)
     assert frame.count(0) == 1 and frame[-1] == 0 and len(frame) <= LONGEST + 1
     (received,) = Receiver().feed(frame)
-    assert (received.type, received.seq) == (protocol.code_of(type(message)), seq)
+    assert (received.type, received.seq) == (code_of(type(message)), seq)
     assert protocol.payload_of(decode(received)) == received.payload == protocol.payload_of(message)
     assert type(decode(received)) is type(message)
 
@@ -114,7 +131,7 @@ def test_damage_costs_the_frames_it_hits_and_no_more(fault, rate, frames_sent):
     receiver, sent, hit, got = Receiver(), 0, 0, 0
     last_hit = False
     for n in range(frames_sent):
-        message = protocol.Echo(data=rng.randbytes(n % 30))
+        message = Echo(data=rng.randbytes(n % 30))
         whole = encode(message, n % 256)
         damaged = bytearray()
         for byte in whole:
@@ -140,12 +157,12 @@ def test_a_receiver_holds_one_frame_at_most():
     for _ in range(1000):
         assert receiver.feed(b"\x05garbage") == []
     assert len(receiver._buffer) <= LONGEST + 1
-    assert [frame.seq for frame in receiver.feed(b"\0" + encode(protocol.Stop(), 9))] == [9]
+    assert [frame.seq for frame in receiver.feed(b"\0" + encode(Stop(), 9))] == [9]
     assert receiver.dropped == 1
 
 
 def test_a_wrong_crc_is_never_accepted():
-    whole = encode(protocol.Start(set_id=7, crc=0x12345678, boot_id=9, stop=1), 3)
+    whole = encode(Start(set_id=7, crc=0x12345678, boot_id=9, stop=1), 3)
     for place in range(len(whole) - 1):
         for bit in range(8):
             broken = bytearray(whole)
@@ -169,7 +186,7 @@ def test_a_payload_that_is_no_message_is_refused(frame, words):
         decode(frame)
 
 
-@pytest.mark.parametrize("message", [protocol.Clear(boot_id=2**32, stop=0), protocol.Echo(data=bytes(65))])
+@pytest.mark.parametrize("message", [Clear(boot_id=2**32, stop=0), Echo(data=bytes(65))])
 def test_what_does_not_fit_is_refused(message):
     with pytest.raises(WireError):
         encode(message, 0)
@@ -178,7 +195,7 @@ def test_what_does_not_fit_is_refused(message):
 def test_a_number_too_large_for_the_wire_is_refused():
     values = dict.fromkeys(("K0_N_per_mm", "K1_N_per_mm", "B1_N_s_alpha_per_mm", "alpha", "force_limit_N"), 1e300)
     with pytest.raises(WireError, match="SET_PARAMS cannot be packed"):
-        encode(protocol.SetParams(set_id=1, memory=0, length=101, tick_rate_Hz=1000, **values), 0)
+        encode(SetParams(set_id=1, memory=0, length=101, tick_rate_Hz=1000, **values), 0)
 
 
 @pytest.mark.parametrize("reason", list(reasons.NackReason))
@@ -201,8 +218,8 @@ def test_every_hold_has_words():
 
 
 def test_a_capture_is_read_to_its_end():
-    good = encode(protocol.Stop(), 1)
-    capture = b"\0" + good + b"\x03ab\0" + encode(protocol.Echo(data=b"x"), 2) + good[:3]
+    good = encode(Stop(), 1)
+    capture = b"\0" + good + b"\x03ab\0" + encode(Echo(data=b"x"), 2) + good[:3]
     entries = list(protocol.frames_in(capture))
     assert [place for place, *_ in entries] == [1, 1 + len(good), 5 + len(good), len(capture) - 3]
     assert [type(message).__name__ for _, message, _ in entries] == ["Stop", "WireError", "Echo", "WireError"]
@@ -229,7 +246,7 @@ def test_floats_are_rounded_once():
     message = decode(
         Receiver().feed(
             encode(
-                protocol.Drive(
+                Drive(
                     mode=1,
                     shape=0,
                     offset=0.1,

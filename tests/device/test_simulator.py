@@ -7,10 +7,10 @@ import pytest
 from material import FOAM, force, position
 from simulated import ENVIRONMENT, FaultyPort, needs_device, own_cache  # noqa: F401
 
-from hilbo.device import protocol
+from hilbo.device import messages
 from hilbo.device.link import Link
 from hilbo.device.local.simulator import Simulator
-from hilbo.device.protocol import NackReason, SampleFlag
+from hilbo.device.reasons import NackReason, SampleFlag
 from hilbo.device.telemetry import Samples
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, RefusalError, Renderer, State
@@ -145,7 +145,7 @@ def test_a_drive_that_ends_early_is_not_used():
             device_tests.drive(device, "position", "hold", 3.0, duration=120.0)
 
 
-STEPS = [protocol.SetParams, protocol.Commit, protocol.GetSet, protocol.Start]
+STEPS = [messages.SetParams, messages.Commit, messages.GetSet, messages.Start]
 
 
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step.__name__)
@@ -161,7 +161,7 @@ def test_a_restart_at_any_step_never_renders_what_nobody_confirmed(step):
         device.link.request = request
         with pytest.raises(DeviceError, match="the device has restarted"):
             _send_and_start(device)
-        status = ask(protocol.GetStatus())
+        status = ask(messages.GetStatus())
         assert (status.state, status.active_id) == (State.STOPPED, 0)
         assert device.reconnect() is False
         assert device.in_force() is None and device.state() == State.STOPPED

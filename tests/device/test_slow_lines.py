@@ -12,9 +12,9 @@ import pytest
 from simulated import needs_device, own_cache  # noqa: F401
 from slow_line import SlowLine
 
-from hilbo.device import protocol
+from hilbo.device import messages
 from hilbo.device.local.simulator import Simulator
-from hilbo.device.protocol import Estop, Start
+from hilbo.device.messages import Estop, Start
 from hilbo.device.reasons import SampleFlag
 from hilbo.hardware_bridge import DeviceError, Renderer
 
@@ -57,7 +57,7 @@ def test_estop_acts_within_the_watchdog_whatever_the_delay(line, delay):
 def test_estop_ends_force_where_the_line_loses_every_estop(line):
     """Heartbeats end with the request, so that the device lets go by itself; 3,245 ticks were measured before."""
     with contextlib.suppress(DeviceError), pressed(line) as device:
-        line.lose = protocol.Estop
+        line.lose = messages.Estop
         asked = line.tick
         stopping = threading.Thread(target=unanswered, args=(device.estop,))
         stopping.start()

@@ -21,7 +21,7 @@ from hilbo.app.rehearsal.robot import Client
 from hilbo.app.rigs import device_rig
 from hilbo.app.rigs.device_rig import DeviceRig
 from hilbo.app.server import serve
-from hilbo.device import protocol
+from hilbo.device import messages
 from hilbo.device.link import Link
 from hilbo.device.ports import BAUD, open_port
 from hilbo.errors import InputError
@@ -279,7 +279,7 @@ def until_held(port: str) -> None:
         with contextlib.suppress(InputError):  # whoever sent heartbeats may still be dying
             link = Link(open_port(port, BAUD), patience=5.0)
             try:
-                if link.request(protocol.GetStatus()).state == State.HOLD:
+                if link.request(messages.GetStatus()).state == State.HOLD:
                     return
             finally:
                 link.close()

@@ -10,7 +10,7 @@ import zlib
 from collections import Counter
 from functools import partial
 
-from hilbo.device import protocol
+from hilbo.device import frames, messages, protocol
 from hilbo.device.link import Link
 from hilbo.device.messages import code_of
 from hilbo.device.ports import SocketPort
@@ -80,7 +80,7 @@ class Peer:
         self.socket.shutdown(socket.SHUT_WR)
 
     def _serve(self, line):
-        receiver = protocol.Receiver()
+        receiver = frames.Receiver()
         with line, contextlib.suppress(OSError):
             while data := line.recv(4096):
                 for frame in receiver.feed(data):
@@ -89,7 +89,7 @@ class Peer:
 
     def _take(self, line, frame):
         message = protocol.decode(frame)
-        if isinstance(message, protocol.Heartbeat):
+        if isinstance(message, messages.Heartbeat):
             self.heartbeats += 1
             self.ticks += 50
             if self.pulses:
@@ -124,32 +124,32 @@ class Peer:
             if times == 1:
                 del self.refuse[kind]
             return self._nack(kind, **refusal)
-        if not self.greeted and kind not in (protocol.Hello, protocol.GetStatus, protocol.Stop, protocol.Estop):
+        if not self.greeted and kind not in (messages.Hello, messages.GetStatus, messages.Stop, messages.Estop):
             return self._nack(kind, reason=NackReason.NO_HELLO)
         if getattr(message, "boot_id", self.boot_id) != self.boot_id:
             return self._nack(kind, reason=NackReason.BOOT_ID)
-        return getattr(self, f"_{protocol.name_of(kind).lower()}", self._ack)(message)
+        return getattr(self, f"_{messages.name_of(kind).lower()}", self._ack)(message)
 
     def _nack(self, kind, reason, ticks=0, value=0.0, limit=0.0):
-        return protocol.Nack(request=code_of(kind), reason=int(reason), ticks=ticks, value=value, limit=limit)
+        return messages.Nack(request=code_of(kind), reason=int(reason), ticks=ticks, value=value, limit=limit)
 
     def _pulse(self):
         known = {"tick": self.ticks, "boot_id": self.boot_id, "state": int(self.state), "reason": 0}
-        return protocol.Pulse(**known, stops=self.stops)
+        return messages.Pulse(**known, stops=self.stops)
 
     def _ack(self, message, crc=0, set_id=0):
-        self.stops += isinstance(message, protocol.Stop | protocol.Estop)
-        changes = {protocol.Start: State.RUNNING, protocol.Stop: State.STOPPED, protocol.Estop: State.ESTOP}
+        self.stops += isinstance(message, messages.Stop | messages.Estop)
+        changes = {messages.Start: State.RUNNING, messages.Stop: State.STOPPED, messages.Estop: State.ESTOP}
         self.state = changes.get(type(message), self.state)
-        return protocol.Ack(request=code_of(type(message)), set_id=set_id, crc=crc, stops=self.stops)
+        return messages.Ack(request=code_of(type(message)), set_id=set_id, crc=crc, stops=self.stops)
 
     def _hello(self, message):
         self.greeted = True
-        names = {name: 0 for name in protocol._wire(protocol.HelloReply)}
-        floats = {name: 0.0 for name, word in protocol._wire(protocol.HelloReply).items() if word == "f32"}
-        known = {"version": protocol.VERSION, "schema": protocol.SCHEMA, "boot_id": self.boot_id}
+        names = {name: 0 for name in protocol._wire(messages.HelloReply)}
+        floats = {name: 0.0 for name, word in protocol._wire(messages.HelloReply).items() if word == "f32"}
+        known = {"version": messages.VERSION, "schema": messages.SCHEMA, "boot_id": self.boot_id}
         rest = {"tick_rate_Hz": 1000, "encoder_step_mm": 0.0127, "most_taps": 255, "watchdog_ticks": 250}
-        return protocol.HelloReply(**(names | floats | rest | known | self.hello))
+        return messages.HelloReply(**(names | floats | rest | known | self.hello))
 
     def _set_params(self, message):
         self.staged = [message, zlib.crc32(protocol.payload_of(message))]
@@ -161,16 +161,16 @@ class Peer:
 
     def _commit(self, message):
         if self.staged is None:
-            return self._nack(protocol.Commit, NackReason.NOTHING_STAGED)
+            return self._nack(messages.Commit, NackReason.NOTHING_STAGED)
         self.active = self.staged
         return self._ack(message, self.active[1], message.set_id)
 
     def _get_set(self, message):
         if self.active is None:
-            return protocol.Set(bank=0, flags=0, crc=0, minimum_damping_N_s_per_m=0.0, **NO_SET)
+            return messages.Set(bank=0, flags=0, crc=0, minimum_damping_N_s_per_m=0.0, **NO_SET)
         head, crc = self.active
         values = {name: getattr(head, name) for name in NO_SET}
-        return protocol.Set(
+        return messages.Set(
             **({"bank": 0, "flags": 1, "crc": crc, "minimum_damping_N_s_per_m": 0.5} | values | self.lie)
         )
 
@@ -178,15 +178,15 @@ class Peer:
         ends = {
             f"{name}_{end}": float(end == "high") for name in ("K0", "K1", "B1", "alpha") for end in ("low", "high")
         }
-        return protocol.Limits(**ends, delay_us=0, continuous_force_N=20.0, heating_s=10.0)
+        return messages.Limits(**ends, delay_us=0, continuous_force_N=20.0, heating_s=10.0)
 
     def _get_status(self, message):
-        counts = {name: 0 for name, word in protocol._wire(protocol.Status).items() if word != "f32"}
-        floats = {name: 0.0 for name, word in protocol._wire(protocol.Status).items() if word == "f32"}
+        counts = {name: 0 for name, word in protocol._wire(messages.Status).items() if word != "f32"}
+        floats = {name: 0.0 for name, word in protocol._wire(messages.Status).items() if word == "f32"}
         known = {"boot_id": self.boot_id, "state": int(self.state), "stops": self.stops, "tick": self.ticks}
         if self.active:
             known |= {"active_id": self.active[0].set_id, "active_crc": self.active[1]}
-        return protocol.Status(**(counts | floats | known))
+        return messages.Status(**(counts | floats | known))
 
     def _echo(self, message):
-        return protocol.EchoReply(data=message.data)
+        return messages.EchoReply(data=message.data)

@@ -13,8 +13,8 @@ import time
 import tty
 from collections import deque
 
-from hilbo.device import protocol
-from hilbo.device.frames import opened
+from hilbo.device import messages, protocol
+from hilbo.device.frames import Receiver, WireError, opened
 
 __all__ = ["SlowLine"]
 
@@ -34,7 +34,7 @@ class SlowLine:
         tty.setraw(self._file, termios.TCSANOW)
         self._server = socket.create_server(("127.0.0.1", 0))
         self.where = f"socket://127.0.0.1:{self._server.getsockname()[1]}"
-        self._receiver = protocol.Receiver()
+        self._receiver = Receiver()
         self._over = threading.Event()
 
     def __enter__(self) -> "SlowLine":
@@ -94,13 +94,13 @@ class SlowLine:
         if self.lose is None:
             return data
         frames = [part for part in data.split(b"\0") if part]
-        return b"".join(part + b"\0" for part in frames if opened(part).type != protocol.code_of(self.lose))
+        return b"".join(part + b"\0" for part in frames if opened(part).type != messages.code_of(self.lose))
 
     def _see(self, data: bytes) -> None:
         for frame in self._receiver.feed(data):
-            with contextlib.suppress(protocol.WireError):
+            with contextlib.suppress(WireError):
                 message = protocol.decode(frame)
-                if isinstance(message, protocol.Telemetry):
+                if isinstance(message, messages.Telemetry):
                     self.samples += [
                         (message.tick + i * message.divisor, sample.force_N, sample.flags)
                         for i, sample in enumerate(message.samples)

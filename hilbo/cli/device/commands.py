@@ -194,7 +194,9 @@ def decode(
     """Captured bytes made readable: every frame, and what is wrong with the others."""
     from dataclasses import asdict
 
-    from hilbo.device.protocol import WireError, frames_in, name_of
+    from hilbo.device.frames import WireError
+    from hilbo.device.messages import name_of
+    from hilbo.device.protocol import frames_in
 
     try:
         data = capture.read_bytes()
@@ -256,7 +258,7 @@ def _begin(device: Any, wanted: dict[str, Any] | None) -> None:
 
 def _at_once(line: Line, name: str, as_json: bool) -> None:
     """Send a request that a device obeys before HELLO, with nothing before it."""
-    from hilbo.device import protocol
+    from hilbo.device import messages
     from hilbo.device.link import Link
     from hilbo.device.ports import open_port
 
@@ -266,7 +268,7 @@ def _at_once(line: Line, name: str, as_json: bool) -> None:
     else:
         link = Link(open_port(line.device, line.baud), patience=line.patience or 0.1)
         try:
-            link.request(getattr(protocol, name)())
+            link.request(getattr(messages, name)())
         finally:
             link.close()
     print_result({"done": name.lower()}, "done", as_json)

@@ -190,7 +190,7 @@ def _content(result: Any, damping: float, delay_us: int) -> dict[str, Any]:
 
 def _header(device: Any, content: dict[str, Any], base: Path | None, text: str | None) -> str:
     """The header's text. Raises `DeviceError` for a delay that is longer than a tick."""
-    from hilbo.device import protocol
+    from hilbo.device import messages
     from hilbo.device.config_header import header, with_measured
     from hilbo.device.failures import DeviceError
 
@@ -200,7 +200,7 @@ def _header(device: Any, content: dict[str, Any], base: Path | None, text: str |
             f"The longest delay is {delay['longest']} us, and with its margin {delay['header']} us, longer than a tick;"
             " make the firmware faster, or lower its tick rate."
         )
-    about, limits = device.device, device.link.request(protocol.GetLimits())
+    about, limits = device.device, device.link.request(messages.GetLimits())
     if text is not None:
         return with_measured(text, str(base), about, limits, damping["header"], delay["header"])
     about_damping = f"measured: {damping['value']:.4g}, 95 % interval {damping['lower']:.4g} to {damping['upper']:.4g}"
