@@ -26,6 +26,7 @@ from hilbo.session.choose.warm_start import read_warm_start
 from hilbo.session.log import actions
 from hilbo.session.log.event_log import read_log
 from hilbo.session.log.header import header_for
+from hilbo.session.log.log_files import log_paths
 from hilbo.session.plan.participants import add_person
 from hilbo.session.plan.plan import make_plan, planned_part, reissue
 from hilbo.session.withdrawal.withdrawal import delete_participant
@@ -263,18 +264,58 @@ def test_a_session_that_was_begun_keeps_its_log_when_the_device_is_not_there(tmp
 
 
 def test_a_log_of_somebody_else_or_of_another_material_is_not_resumed(tmp_path):
-    """P_1's session x and P's session 1_x would have files of one name."""
+    """P_1's session x and P's session 1_x have files of two names, and one that was renamed is known by its header."""
     study_of(tmp_path)
     file, logs = tmp_path / "study.toml", tmp_path / "logs"
     file.write_text(file.read_text() + "\n[materials.foam]\n[materials.gel]\n")
     wanted = Wanted(file, "P_1", "x", logs=logs, material="foam", dry_run=True)
     opened(wanted, lambda *_: None, lambda *_: None)[1].close()
+    other = opened(wanted._replace(participant="P", session="1_x"), lambda *_: None, lambda *_: None)[1]
+    other.close()
+    other.path.write_bytes((logs / "P_1_x.session.jsonl").read_bytes())
     for change, words in (
         ({"participant": "P", "session": "1_x"}, "is session x of participant P_1; choose another --session"),
         ({"material": "gel"}, "was begun with the material foam; choose another --session, or --material"),
     ):
         with pytest.raises(InputError, match=words):
             opened(wanted._replace(resume=True, **change), lambda *_: None, lambda _: None)
+    opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)[1].close()
+
+
+def test_of_two_sessions_of_one_person_at_once_the_second_is_refused(tmp_path):
+    study_of(tmp_path)
+    wanted = Wanted(tmp_path / "study.toml", "P01", "1", logs=tmp_path, dry_run=True)
+    people = tmp_path / "participants.csv"
+    people.write_text("participant,consent_time,protocol_number\nP01,2026-05-04T10:15,7\nP02,2026-05-04T10:15,7\n")
+
+    def started(**changes):
+        return opened(wanted._replace(dry_run=False)._replace(**changes), lambda *_: None, lambda *_: None)[1]
+
+    first = started()
+    for change in ({"session": "2"}, {"session": "2", "seed": 5}):
+        with pytest.raises(InputError, match=r"P01_1\.session\.jsonl: session 1 of P01 is running; end that one first"):
+            started(**change)
+    assert [path.name for path in log_paths(tmp_path)] == ["P01_1.session.jsonl"]
+    for change in ({"session": "2", "dry_run": True}, {"participant": "P02"}):
+        started(**change).close()
+    first.close()
+    second = started(session="3")
+    with pytest.raises(InputError, match="session 3 of P01 is running"):
+        started(resume=True)
+    assert first.path.is_file()
+    second.close()
+    started(resume=True).close()
+
+
+def test_a_session_that_was_begun_under_another_name_is_not_begun_again(tmp_path):
+    study_of(tmp_path)
+    wanted = Wanted(tmp_path / "study.toml", "P01", "day 1", logs=tmp_path, dry_run=True)
+    log = opened(wanted, lambda *_: None, lambda *_: None)[1]
+    log.close()
+    log.path.rename(tmp_path / "P01_day-1.session.jsonl")
+    with pytest.raises(InputError, match=f"is session day 1 of P01; rename it to {log.path.name} and add --resume"):
+        opened(wanted, lambda *_: None, lambda *_: None)
+    (tmp_path / "P01_day-1.session.jsonl").rename(log.path)
     opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)[1].close()
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import zlib
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -300,6 +301,15 @@ def test_what_no_reader_would_accept_is_not_written(tmp_path, event, why):
         assert path.read_bytes() == before and log.state is state
         log.append(Event(seq=1, kind="device", time=0.0, data=READY))
     assert [event.kind for event in read_log(path)[1]] == ["device"]
+
+
+def test_no_two_sessions_have_one_file_name():
+    parts = ("A", "1", "A_1", "1_2", "2", "A-1", "1-2", "1 2", "1~2", "_", "-", "é", "e\u0301", "x" * 64)
+    pairs = [(person, label) for person in parts[:6] for label in parts]
+    names = [log_name(msgspec.structs.replace(header(), participant=p, session=label)) for p, label in pairs]
+    assert len(set(names)) == len(pairs)
+    assert log_name(header()) == "P01_1.session.jsonl"
+    assert all(name.isascii() and not set(name) & set(' /\\:*?"<>|') for name in names)
 
 
 KILLED = """

@@ -1,5 +1,6 @@
 """One reader of CSV files: what one table refuses, every table refuses in the same words; what one takes, all take."""
 
+import pandas as pd
 import pytest
 from live import STUDY
 
@@ -93,3 +94,29 @@ def test_a_withdrawal_finds_the_rows_of_every_table_that_is_taken(tmp_path):
     path.write_text("\n,,\nparticipant,trial,response\nP1,1,close\nP2,1,close\n")
     delete_participant(tmp_path, "P1")
     assert path.read_text() == "participant,trial,response\nP2,1,close\n"
+
+
+def wide(path, columns):
+    names = ["participant", "trial", "response", "u", "v", *(f"c{i}" for i in range(columns))]
+    row = ["P01", "1", "close", "0.5", "0.5", *("x" for _ in range(columns))]
+    path.write_text(f"{','.join(names)}\n{','.join(row)}\n")
+    return path
+
+
+def test_more_columns_than_a_spreadsheet_has_are_refused(tmp_path):
+    with pytest.raises(
+        InputError, match=":1: has 100005 columns; a table has 16384 at most, leave out what is not need"
+    ):
+        read_trials(wide(tmp_path / "wide.csv", 100_000), STUDY)
+
+
+def test_a_table_of_many_columns_is_made_at_once(tmp_path, monkeypatch):
+    """A column that is added to a frame costs as much as there are columns: 3,000 of them took half a minute."""
+    whole, put = pd.DataFrame.__setitem__, []
+    monkeypatch.setattr(pd.DataFrame, "__setitem__", lambda *given: (put.append(given[1]), whole(*given)))
+    counts = []
+    for columns in (5, 50):
+        read_trials(wide(tmp_path / "wide.csv", columns), STUDY)
+        counts.append(len(put))
+        put.clear()
+    assert counts[0] == counts[1]

@@ -20,7 +20,7 @@ from hilbo.session.choose.warm_start import read_warm_start
 from hilbo.session.log.event_log import EventLog
 from hilbo.session.log.header import header_for, participant_seed
 from hilbo.session.log.header_check import study_of
-from hilbo.session.log.log_files import begun, log_name
+from hilbo.session.log.log_files import check_alone, check_new, log_name
 from hilbo.session.log.records import Header
 from hilbo.session.log.state import LiveSession
 from hilbo.session.plan.participants import check_consent, read_people
@@ -60,6 +60,11 @@ def opened(
     import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
 
     log, chooser = (_resumed if wanted.resume else _begun)(wanted, study)
+    try:
+        check_alone(log.path, log.state.header)
+    except InputError:
+        let_go(log, wanted.resume)
+        raise
     tag = _tag(log.state.header)
     if study.stimulus is not None:
         rig = functools.partial(StimulusRig, study, tag)
@@ -99,10 +104,7 @@ def _begun(wanted: Wanted, study: StudyFile) -> tuple[EventLog, LiveChooser]:
         )
     header = _header(wanted, study)
     path = wanted.logs / log_name(header)
-    if begun(path):
-        raise InputError(
-            f"{path}: this session has been begun; add --resume to go on with it, or choose another --session."
-        )
+    check_new(path, header)
     warm = _warm_starts(wanted, study, header)
     header = msgspec.structs.replace(header, warm_start=warm_start_sources(warm))
     chooser = LiveChooser(LiveSession.start(study, header), warm)

@@ -15,7 +15,7 @@ from hilbo.errors import InputError
 from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.log import actions as live
 from hilbo.session.log.event_log import EventLog
-from hilbo.session.log.log_files import begun, log_name
+from hilbo.session.log.log_files import begun, check_alone, check_new, log_name
 from hilbo.session.log.records import Header
 from hilbo.session.log.state import LiveSession
 from hilbo.study.config import Study
@@ -34,7 +34,17 @@ class LoggedSession:
     def open(cls, folder: str | os.PathLike, study: Study, header: Header) -> "LoggedSession":
         """Begin a session, or go on with the one of this participant and label. Raises InputError."""
         path = Path(folder) / log_name(header)
-        log = EventLog.resume(path, study.file) if begun(path) else EventLog.create(path, study.file, header)
+        new = not begun(path)
+        if new:
+            check_new(path, header)
+        log = EventLog.create(path, study.file, header) if new else EventLog.resume(path, study.file)
+        try:
+            check_alone(path, log.state.header)
+        except InputError:
+            log.close()
+            if new:
+                path.unlink()
+            raise
         if log.state.header != header:
             log.close()
             raise InputError(f"{path}: was begun with another seed, plan or sets; give those, or another label.")

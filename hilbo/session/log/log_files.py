@@ -1,19 +1,22 @@
 """Names of logs, and the logs of a folder."""
 
+import contextlib
+import hashlib
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from hilbo.errors import InputError
-from hilbo.session.log.log_lines import FIRST, WHY_CUT, is_unbegun
+from hilbo.session.log.log_lines import FIRST, WHY_CUT, is_unbegun, read_lines
 from hilbo.session.log.records import Header
 from hilbo.session.log.rescue import RESCUED
 from hilbo.study.disk.lock import lock
 
-__all__ = ["begun", "in_use", "is_log", "keys_path", "log_name", "log_paths"]
+__all__ = ["begun", "check_alone", "check_new", "in_use", "is_log", "keys_path", "log_name", "log_paths"]
 
 SUFFIX = ".session.jsonl"
+_PLAIN = re.compile("[a-zA-Z0-9.-]+")
 
 
 def begun(path: str | os.PathLike) -> bool:
@@ -38,9 +41,47 @@ def in_use(path: str | os.PathLike) -> bool:
 
 
 def log_name(header: Header) -> str:
-    """File name of a session's log."""
-    parts = (header.participant, header.session)
-    return "_".join(re.sub(r"[^\w.-]", "-", part) for part in parts) + SUFFIX
+    """File name of a session's log, of no other session: the last "_" is before the label, and one with other
+    characters than letters, digits, "." and "-" ends in a part of its SHA-256."""
+    label = header.session
+    if not _PLAIN.fullmatch(label):
+        label = f"{re.sub(r'[^a-zA-Z0-9.-]', '-', label)}~{hashlib.sha256(label.encode()).hexdigest()[:8]}"
+    return f"{re.sub(r'[^a-zA-Z0-9_.-]', '-', header.participant)}_{label}{SUFFIX}"
+
+
+def check_new(path: Path, header: Header) -> None:
+    """Refuse to begin a session at `path` that has been begun: there, or under another name in this folder. Raises
+    InputError."""
+    if begun(path):
+        raise InputError(
+            f"{path}: this session has been begun; add --resume to go on with it, or choose another --session."
+        )
+    for other, first in _theirs(path, header.participant):
+        if first.session == header.session:
+            raise InputError(
+                f"{other}: is session {first.session} of {first.participant}; rename it to {path.name} and add --resume"
+                " to go on with it, or choose another --session."
+            )
+
+
+def check_alone(path: Path, header: Header) -> None:
+    """Refuse a session whose participant has another one that is running, from a log of the same folder: whoever it is
+    whose id is wrong, the answers of two people would be one's. Dry runs are nobody's. Raises InputError."""
+    for other, first in _theirs(path, header.participant):
+        if not first.dry_run and not header.dry_run and in_use(other):
+            raise InputError(
+                f"{other}: session {first.session} of {first.participant} is running; end that one first, or correct"
+                " --participant."
+            )
+
+
+def _theirs(path: Path, participant: str) -> Iterator[tuple[Path, Header]]:
+    """The other logs of a participant in the folder of this one, with their headers."""
+    for other in log_paths(path.parent):
+        with contextlib.suppress(InputError, OSError), open(other, "rb") as file:  # a damaged log is nobody's
+            header = read_lines(file.readline(), other).header
+            if other != path and header.participant == participant:
+                yield other, header
 
 
 def keys_path(log: Path) -> Path:

@@ -19,6 +19,7 @@ __all__ = ["CsvTable", "check_header", "csv_rows", "csv_text", "open_csv", "read
 
 _QUOTED = re.compile(r'"[^"]*"')
 _DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+_MOST_COLUMNS = 16_384  # of Excel and LibreOffice
 _SPREADSHEETS = (".xlsx", ".xls", ".ods")
 _SPREADSHEET = "is a spreadsheet; save it as CSV, by the spreadsheet's own menu"
 Rows = Iterator[tuple[int, list[str]]]
@@ -72,8 +73,14 @@ def csv_text(rows: Iterable[Sequence[str]], delimiter: str = ",") -> str:
 
 
 def check_header(names: Sequence[str], place: str) -> None:
-    """Refuse a column that stands there twice; `place`: file and line, for the sentence."""
-    again = next((name for name in names if names.count(name) > 1), None)
+    """Refuse a column that stands there twice, and more columns than a spreadsheet has; `place`: file and line, for the
+    sentence."""
+    if len(names) > _MOST_COLUMNS:
+        raise InputError(
+            f"{place}: has {len(names)} columns; a table has {_MOST_COLUMNS} at most, leave out what is not needed."
+        )
+    known: set[str] = set()
+    again = next((name for name in names if name in known or known.add(name)), None)
     if again is not None:
         raise InputError(f'{place}: column "{again}" stands there twice; keep one of them.')
 

@@ -150,7 +150,7 @@ def _note_the_absent(
 def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
     """A piece with its numbers as numbers and its texts as one object each, and `_fitted`: which rows count."""
     numeric = {"trial", *study.space.names}
-    table = pd.DataFrame(index=text.index)
+    table: dict[str, object] = {}  # a frame at once: each column that is added to one costs as many as there are
     for column in text.columns:
         if column in numeric:
             table[column] = np.nan  # its place among the columns
@@ -166,7 +166,7 @@ def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, te
     table["category"] = _categories(text["response"], study.responses, source)
     table["_blinded"] = text["unblinded"].str.strip().str.lower().isin(_FALSE) if "unblinded" in text else True
     table["_fitted"] = ~flags(text, "voided", source) & (is_fitted(text["phase"]) if "phase" in text else True)
-    return table
+    return pd.DataFrame(table, index=text.index)
 
 
 def _numbered(names: pd.Series) -> pd.Series:
@@ -303,5 +303,6 @@ def check_texts(text: pd.DataFrame, source: str, numeric: Collection[str] = ()) 
         check_text(str(column), "the name of a column", place(source).rstrip(": "))
         if column not in numeric:
             cells = text[column]
-            wrong = cells.isin(formulas(cells))
-            refuse(wrong, source, lambda row, c=column: f'{c} is "{text.at[row, c]}", {FORMULA_WORDS}.')
+            if run := formulas(cells):
+                wrong = cells.isin(run)
+                refuse(wrong, source, lambda row, c=column: f'{c} is "{text.at[row, c]}", {FORMULA_WORDS}.')
