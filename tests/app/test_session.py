@@ -7,7 +7,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from live_server import PATIENCE, Live, check_blinding, listen, refused
+from live_server import PAIRS, PATIENCE, Live, check_blinding, listen, refused
 
 from hilbo.app.hub.opening import Wanted, opened
 from hilbo.app.pages.views import choice_rows
@@ -235,6 +235,61 @@ def test_the_page_says_how_long_a_pause_was_while_it_lasts_and_after_it(tmp_path
         assert rows(seen)["Pauses"] == "1, the last of 1 d before V2" and "Last activity" not in rows(seen)
         assert any("A pause of 1 d. V2" in words for _, _, words in seen["log"])
         assert seen["whole"]["pauses"][0]["trial"] == 2
+        live.replays()
+
+
+class WarmedUp(Live):
+    """A warm-up of one rendering and a comparison; the warm-up comes again after an hour."""
+
+    def make_study(self, seconds, warm_up):
+        file = super().make_study(seconds, warm_up)
+        path = self.folder / "study.toml"
+        text = path.read_text()
+        path.write_text(text.replace("[session.warm_up]", "[session]\nwarm_up_after_pause = 3600\n[session.warm_up]"))
+        return type(file).load(path)
+
+
+WARMED = (Block("warm-up", 1, (Planned("best"), Planned("mid"))), Block("validation", 2, PAIRS[:2]))
+
+
+def go_on(live):
+    """From the end of the warm-up."""
+    live.until(lambda view: view["phase"] == "ready")
+    live.participant.post("/api/participant/begin", {})
+
+
+deep = pytest.mark.deep  # each starts two servers
+
+
+@pytest.mark.parametrize("how", ["late Begin", pytest.param("break", marks=deep), pytest.param("restart", marks=deep)])
+def test_after_a_long_pause_the_warm_up_comes_again(tmp_path, monkeypatch, how):
+    later = SimpleNamespace(**vars(time) | {"time": lambda: time.time() + 86_400.0})
+
+    def tomorrow():
+        for module in ("hub.hub", "hub.runner"):
+            monkeypatch.setattr(f"hilbo.app.{module}.time", later)
+
+    with WarmedUp(tmp_path, blocks=WARMED) as live:
+        live.begin()
+        live.answer()
+        go_on(live)
+        live.answer()
+        live.until(lambda view: view["phase"] == "step")
+        if how == "break":
+            live.command("pause")
+    if how == "restart":
+        tomorrow()
+    with WarmedUp(tmp_path, blocks=WARMED) as live:
+        live.until(lambda view: view["may"]["begin"] or view["phase"] == "paused")
+        tomorrow()
+        live.command("resume") if how == "break" else live.begin()
+        live.answer()
+        go_on(live)
+        live.answer()
+        live.until(lambda view: view["phase"] == "done")
+        counted = [trial.data["phase"] for trial in live.hub.state.trials if trial.status == "answered"]
+        assert counted == ["warm-up", "validation", "warm-up", "validation"]
+        assert [event.data["pause_s"] > 80_000 for event in live.events("warm_up")] == [True]
         live.replays()
 
 

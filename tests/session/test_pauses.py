@@ -7,7 +7,7 @@ from hilbo.app.pages.log_words import sentence
 from hilbo.app.pages.pace import duration
 from hilbo.session.export.tables import sessions_table
 from hilbo.session.log import actions
-from hilbo.session.log.state import Pause
+from hilbo.session.log.records import Pause
 
 
 @pytest.fixture

@@ -119,9 +119,17 @@ class Runner:
             else:
                 trial = hub.state.pending
                 assert trial is not None  # as the screen says
-                await self._present(trial)
+                if await self._warmed_up_again() or not await self._present(trial):
+                    continue
                 return
         self._at("idle")
+
+    async def _warmed_up_again(self) -> bool:
+        """Whether the warm-up has to come again after a pause, which is logged then."""
+        if not self.hub.state.warms_up_again(time.time()):
+            return False
+        await self.hub.commit(actions.warm_up, mine=True)
+        return True
 
     def _again(self, stop: asyncio.Event) -> None:
         """Restart, unless that was done already."""
@@ -155,13 +163,14 @@ class Runner:
         await hub.commit(make, mine=True)
         self.clock["proposed"] = time.perf_counter()
 
-    async def _present(self, trial: Trial) -> None:
-        """Present the steps of a trial; after a break or a restart of the server they may all be done already."""
+    async def _present(self, trial: Trial) -> bool:
+        """Present the steps of a trial; after a break or a restart of the server they may all be done already. False if
+        nothing was presented, since the warm-up comes again."""
         hub = self.hub
         if trial.step is not None and not trial.unfinished:
             self._look_ahead()
             self._at("answer")
-            return
+            return True
         steps = hub.state.steps_of(trial)
         await hub.rig.blank()
         await self._rig_ready()
@@ -172,6 +181,8 @@ class Runner:
                 self._wake.clear()
                 self._at("hello")
                 await self._wake.wait()
+            if await self._warmed_up_again():  # Begin was pressed long after
+                return False
             if not self._differs:
                 self._look_ahead()
             if hub.gap and trial.id > 1:
@@ -187,6 +198,7 @@ class Runner:
         finally:
             loading.cancel()
         self._at("answer")
+        return True
 
     async def _step(self, trial: Trial, i: int, show: Any, seconds: float) -> None:
         """Present step `i` for so many seconds."""

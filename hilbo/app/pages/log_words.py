@@ -128,6 +128,7 @@ _SENTENCES: dict[str, Callable[[LiveSession, str, Mapping[str, Any]], str]] = {
     "note": lambda _, name, data: f"Note: {data['text']}",
     "more": lambda _, name, data: "The participant wants another rendering of the warm-up.",
     "go_on": lambda _, name, data: "The next part begins.",
+    "warm_up": lambda _, name, data: f"The warm-up comes again after {duration(data['pause_s'])}.",
     "device": _device,
 }
 
@@ -173,7 +174,7 @@ def _remark(state: LiveSession, trial: Trial) -> str:
         "void": "void",
         "left out": "left out",
         "undone": "answer taken back",
-        "dropped": "not asked: an earlier answer changed",
+        "dropped": "not asked: an earlier answer changed, or the warm-up came again",
         "pending": "now",
     }.get(trial.status)
     words = [f"{status}: {reason}" if status and reason else status] if status else []

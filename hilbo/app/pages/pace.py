@@ -25,7 +25,7 @@ def minutes_left(state: LiveSession) -> float:
     gaps = np.diff(times)
     total = 0.0
     for i, block in enumerate(state.header.blocks):
-        left = 0 if state.full(i) else state.quota(i) - len(state.answers(i)) - len(state.skipped(i))
+        left = 0 if state.full(i) else state.quota(i) - len(state.counted(i)) - len(state.skipped(i))
         pace = 1.5 * protocol(state.study.session, block.phase).seconds if len(gaps) < 2 else float(np.median(gaps))
         total += left * pace + (block.rest if left and state.gate(i) == "rest" else 0.0)
     return total / 60.0

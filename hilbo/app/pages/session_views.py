@@ -44,8 +44,8 @@ def participant_view(state: LiveSession) -> View:
 
 def _spare(state: LiveSession) -> bool:
     """Whether the warm-up has another trial to offer."""
-    assert state.block is not None  # the screen is "ready"
-    before = state.block - 1
+    before = None if state.block is None else state.warm_up(state.block)
+    assert before is not None  # the screen is "ready"
     return state.quota(before) < len(state.header.blocks[before].trials)
 
 
@@ -93,8 +93,8 @@ def _progress(state: LiveSession) -> View:
     if state.pending is not None:
         block = state.pending.block
     elif state.screen == "ready":
-        block -= 1
-    done, of = len(state.answers(block)), state.quota(block)
+        block = state.warm_up(block) or 0
+    done, of = len(state.counted(block)), state.quota(block)
     numbers = {"{trial}": min(done + 1, of), "{done}": done, "{of}": of}
     text = state.study.session.text("progress")
     for name, number in numbers.items():
@@ -115,7 +115,7 @@ def experimenter_view(state: LiveSession) -> View:
             {
                 "phase": block.phase,
                 "material": block.material,
-                "done": len(state.answers(i)),
+                "done": len(state.counted(i)),
                 "of": state.quota(i),
                 "skipped": [msgspec.to_builtins(block.trials[k]) for k in state.skipped(i)],
                 "put_off": [_put_off(state, i, k) for k in state.put_off(i)],

@@ -13,8 +13,8 @@ from hilbo.app.interface import HubInterface
 from hilbo.app.pages.log_words import line, meant, place_of, table
 from hilbo.app.pages.pace import duration, minutes_left
 from hilbo.app.pages.session_views import View, experimenter_view, participant_view
-from hilbo.session.log.records import Trial
-from hilbo.session.log.state import PAUSE, LiveSession
+from hilbo.session.log.records import PAUSE, Trial
+from hilbo.session.log.state import LiveSession
 
 __all__ = ["choice_rows", "experimenter", "map_version", "participant", "place_of", "seconds_of", "trial_name"]
 
@@ -231,7 +231,7 @@ def choice_rows(choice: View) -> list[list[str]]:
 
 def _how_far(state: LiveSession, block: int) -> str:
     """Progress of a block: answers, and trials that were skipped or that the device stopped."""
-    words = [f"{len(state.answers(block))} of {state.quota(block)}"]
+    words = [f"{len(state.counted(block))} of {state.quota(block)}"]
     last, out, excluded = (len(f(block)) for f in (state.put_off, state.skipped, state.excluded))
     words += [f"{last} put off to the end: stopped twice by the device"] if last else []
     words += [f"{out} left out"] if out else []

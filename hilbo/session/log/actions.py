@@ -39,6 +39,7 @@ __all__ = [
     "skip",
     "undo",
     "void",
+    "warm_up",
 ]
 
 
@@ -216,7 +217,7 @@ def _filled(state: LiveSession, trial: Trial) -> bool:
         pending = state.pending
         waits = trial.repeats in state.wanted or (pending is not None and pending.repeats == trial.repeats)
         return bool(trial.voided and trial.voided.get("asked_again")) and not waits
-    others = state.answers(trial.block)
+    others = state.counted(trial.block)
     if trial.planned is None:
         beside = trial.voided["beside"] if trial.voided else ()  # a level may have been answered before, for itself
         same = any(other.id not in beside and other.renderings == trial.renderings for other in others)
@@ -267,9 +268,9 @@ def more(state: LiveSession, at: float) -> Event:
 
     Raises `RefusedError` elsewhere, and when all of its renderings have been felt.
     """
-    if state.screen != "ready" or state.block is None:
+    before = None if state.block is None else state.warm_up(state.block)
+    if state.screen != "ready" or before is None:
         raise RefusedError("nothing", "another rendering can be had at the end of the warm-up only.")
-    before = state.block - 1
     if state.quota(before) >= len(state.header.blocks[before].trials):
         raise RefusedError("nothing", "all renderings of the warm-up have been felt.")
     return _event(state, "more", at, block=before)
@@ -280,6 +281,13 @@ def go_on(state: LiveSession, at: float) -> Event:
     if state.screen not in ("ready", "rest"):
         raise RefusedError("nothing", "there is nothing to go on to: no warm-up or rest has come to its end.")
     return _event(state, "go_on", at, block=state.block)
+
+
+def warm_up(state: LiveSession, at: float) -> Event:
+    """The warm-up comes again, since a pause has been as long as the study says. Raises `RefusedError` otherwise."""
+    if not state.warms_up_again(at) or state.block is None or state.active is None:
+        raise RefusedError("nothing", "the warm-up does not come again now.")
+    return _event(state, "warm_up", at, block=state.warm_up(state.block), pause_s=at - state.active)
 
 
 def device(state: LiveSession, condition: str, at: float, *, trial: int | None = None, **facts) -> Event:

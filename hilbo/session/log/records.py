@@ -5,17 +5,19 @@ Times are seconds since the epoch, put into events by whoever has a clock.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 
 from hilbo.errors import InputError
 from hilbo.study.file.plan_file import Block
 
-__all__ = ["SCHEMA", "Event", "Header", "Need", "RefusedError", "Status", "Trial"]
+__all__ = ["PAUSE", "SCHEMA", "Event", "Header", "Need", "Pause", "RefusedError", "Status", "Trial", "WarmUp"]
 
 SCHEMA = 3
 """Of a log's lines and header."""
+PAUSE = 60.0  # s
+"""The shortest time that counts as a pause."""
 Status = Literal["pending", "answered", "undone", "void", "dropped", "left out"]
 
 
@@ -123,3 +125,22 @@ class Trial:
     def first(self) -> str:
         """The side that is felt first."""
         return self.data.get("first", "a")
+
+
+class Pause(NamedTuple):
+    """A time of `seconds`, at least `PAUSE`, in which nothing was presented or answered, whatever its cause: a break, a
+    rest, a server that did not run. Event `seq`, of trial `trial`, ended it."""
+
+    seq: int
+    trial: int
+    seconds: float
+
+
+class WarmUp(NamedTuple):
+    """A warm-up that comes again: its block, the block that follows it, the number of trials before it, and its time
+    (s)."""
+
+    block: int
+    following: int | None
+    trials: int
+    time: float

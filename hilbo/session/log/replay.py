@@ -80,6 +80,11 @@ class _Words(msgspec.Struct):
     text: str = ""
 
 
+class _WarmUp(msgspec.Struct):
+    block: _Whole
+    pause_s: float
+
+
 class _Device(msgspec.Struct):
     condition: Literal["ready", "running", "stopped", "hold", "estop", "lost"]
     trial: _Whole | None
@@ -126,6 +131,7 @@ _KINDS: dict[str, tuple[type, _Again]] = {
     "note": (_Words, lambda s, d, raw, at: _worded(actions.note(s, "", at), text=d.text)),
     "more": (_Words, lambda s, d, raw, at: actions.more(s, at)),
     "go_on": (_Words, lambda s, d, raw, at: actions.go_on(s, at)),
+    "warm_up": (_WarmUp, lambda s, d, raw, at: actions.warm_up(s, at)),
     "device": (
         _Device,
         lambda s, d, raw, at: actions.device(s, d.condition, at, trial=d.trial, **_without(raw, "condition", "trial")),

@@ -16,29 +16,17 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import itemgetter
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from hilbo.errors import InputError
-from hilbo.session.log.records import Event, Header, Need, RefusedError, Trial
+from hilbo.session.log.records import PAUSE, Event, Header, Need, Pause, RefusedError, Trial, WarmUp
 from hilbo.session.log.transitions import APPLY, STOPS, stop_key
 from hilbo.study.file.protocols import protocol
 from hilbo.study.file.reading import StudyFile
 
-__all__ = ["PAUSE", "LiveSession", "Pause", "Screen"]
-
-PAUSE = 60.0  # s
-"""The shortest time that counts as a pause."""
+__all__ = ["LiveSession", "Screen"]
 
 Screen = Literal["wait", "trial", "ready", "rest", "paused", "done", "ended"]
-
-
-class Pause(NamedTuple):
-    """A time of `seconds`, at least `PAUSE`, in which nothing was presented or answered, whatever its cause: a break, a
-    rest, a server that did not run. Event `seq`, of trial `trial`, ended it."""
-
-    seq: int
-    trial: int
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -60,6 +48,7 @@ class LiveSession:
     last: float | None = None
     active: float | None = None  # the time of the last event of a presentation, or response
     pauses: tuple[Pause, ...] = ()
+    again: WarmUp | None = None  # the last one
 
     @classmethod
     def start(cls, study: StudyFile, header: Header) -> "LiveSession":
@@ -111,6 +100,24 @@ class LiveSession:
         """The trials of a block that count, in their order; repeats do not."""
         return [t for t in self.trials if t.block == block and t.status == "answered" and t.repeats is None]
 
+    def counted(self, block: int) -> list[Trial]:
+        """The answers that fill a block: of a warm-up that came again those since then, else all."""
+        after = self.again.trials if self.again is not None and self.again.block == block else 0
+        return [t for t in self.answers(block) if t.id > after]
+
+    def warm_up(self, block: int) -> int | None:
+        """The last warm-up among the blocks up to this one."""
+        phases = [b.phase for b in self.header.blocks[: block + 1]]
+        return max((i for i, phase in enumerate(phases) if phase == "warm-up"), default=None)
+
+    def warms_up_again(self, at: float) -> bool:
+        """Whether the study has the warm-up again after the pause that lasts until the time `at` (s)."""
+        after, here = self.study.session.warm_up_after_pause, self.block
+        if after is None or here is None or self.active is None or self.screen not in ("trial", "wait"):
+            return False
+        known = self.again is not None and self.again.time >= self.active
+        return at - self.active >= after and not known and self.warm_up(here) is not None
+
     def quota(self, block: int) -> int:
         """How many trials of a block are needed."""
         return self.header.blocks[block].count + self.extra.get(block, 0)
@@ -132,7 +139,7 @@ class LiveSession:
         """Planned trials without an answer that the device stopped twice; they come last."""
         if not self.header.blocks[block].trials:
             return []
-        done = {t.planned for t in self.answers(block)} | set(self.skipped(block))
+        done = {t.planned for t in self.counted(block)} | set(self.skipped(block))
         return sorted(k for k, count in self.stops(block).items() if count >= STOPS and k not in done)
 
     def skipped(self, block: int) -> list[int]:
@@ -143,9 +150,9 @@ class LiveSession:
 
     def _next_planned(self, block: int) -> int | None:
         """The next planned trial without an answer; None where the block has enough, or none is left."""
-        if len(self.answers(block)) >= self.quota(block):
+        if len(self.counted(block)) >= self.quota(block):
             return None
-        done = {t.planned for t in self.answers(block)} | set(self.skipped(block))
+        done = {t.planned for t in self.counted(block)} | set(self.skipped(block))
         left = [i for i in range(len(self.header.blocks[block].trials)) if i not in done]
         stops = self.stops(block)
         return min(left, key=lambda i: (stops[i] if stops[i] >= STOPS else 0, i), default=None)
@@ -154,7 +161,7 @@ class LiveSession:
         """Whether a block has all its answers, or nothing more to ask."""
         if self.header.blocks[block].trials:
             return self._next_planned(block) is None
-        return len(self.answers(block)) >= self.quota(block)
+        return len(self.counted(block)) >= self.quota(block)
 
     @cached_property
     def block(self) -> int | None:
@@ -165,6 +172,8 @@ class LiveSession:
         """What stands before a block until somebody goes on: the end of a warm-up, or a rest."""
         if block == 0 or block in self.passed:
             return None
+        if self.again is not None and self.again.following == block:
+            return "ready"
         if self.header.blocks[block].rest > 0:
             return "rest"
         return "ready" if self.header.blocks[block - 1].phase == "warm-up" else None
@@ -189,7 +198,8 @@ class LiveSession:
         """What is to be proposed now; None while a trial is pending or nothing is to be asked."""
         if self.screen != "wait":
             return None
-        if self.wanted:
+        warming = self.again is not None and self.again.block == self.block
+        if self.wanted and not warming:
             source = self.trial(self.wanted[0])
             return Need(source.block, source.planned, source.id)
         assert self.block is not None

@@ -11,7 +11,7 @@ from typing import Any
 
 from hilbo.session.log.header_check import study_of
 from hilbo.session.log.presented import counted
-from hilbo.session.log.records import Trial
+from hilbo.session.log.records import Trial, WarmUp
 
 __all__ = ["APPLY", "STOPS", "stop_key"]
 
@@ -167,6 +167,18 @@ def _missed(state, event):
     return _made_void(state, trial, "rule", reason, {event.data["show"]} & set(trial.renderings))
 
 
+def _warm_up_again(state, event):
+    """The pending proposal is made again after the warm-up, and so is a repetition."""
+    trial, block = state.pending, event.data["block"]
+    if trial is not None:
+        state = state.with_trial(trial.id, status="dropped", on=None)
+    if trial is not None and trial.repeats:
+        state = replace(state, wanted=(trial.repeats, *state.wanted))
+    following = state.block if state.block != block else block + 1
+    again = WarmUp(block, following, len(state.trials), event.time)
+    return replace(state, again=again, extra={**state.extra, block: 0}, passed=state.passed - {following})
+
+
 APPLY = {
     "propose": _proposed,
     "sent": _sent,
@@ -186,5 +198,6 @@ APPLY = {
         state, extra={**state.extra, event.data["block"]: state.extra.get(event.data["block"], 0) + 1}
     ),
     "go_on": lambda state, event: replace(state, passed=state.passed | {event.data["block"]}),
+    "warm_up": _warm_up_again,
     "device": _device,
 }

@@ -77,6 +77,9 @@ _Steps = Annotated[
 ]
 _Texts = Annotated[dict[str, str], words("a table of texts", '{question = "…"}')]
 _Count = Annotated[Annotated[int, msgspec.Meta(ge=1, le=1000)] | None, words("a whole number from 1 to 1000", "12")]
+_Pause = Annotated[
+    Annotated[float, msgspec.Meta(ge=60.0, le=1e9)] | None, words("a number of seconds, at least 60", "3600")
+]
 
 
 class PhaseTable(Table, frozen=True):
@@ -95,6 +98,7 @@ class SessionTable(Table, frozen=True):
     texts: _Texts = msgspec.field(default_factory=dict)
     labels: _Texts = msgspec.field(default_factory=dict)
     definitions: _Texts = msgspec.field(default_factory=dict)
+    warm_up_after_pause: _Pause = None
     warm_up: PhaseTable = PhaseTable()
     optimisation: PhaseTable = PhaseTable()
     validation: PhaseTable = PhaseTable()
