@@ -13,7 +13,7 @@ from hilbo.report.kernel_words import covariance_words, formula
 from hilbo.report.participants import People
 from hilbo.study.config import Study
 
-__all__ = ["Pictures", "estimate_words", "heads", "number", "percent", "rendered", "results_page"]
+__all__ = ["Pictures", "estimate_words", "heads", "number", "percent", "rendered", "results_page", "text_of"]
 
 Pictures = dict[str, dict[str, str]]
 """Figures by name, each with `png` (base64) and `width` (pixels), of `results.save_figures`."""
@@ -76,6 +76,12 @@ def rendered(name: str, **facts: Any) -> str:
     return _environment().get_template(name).render(**facts)
 
 
+def text_of(name: str, **facts: Any) -> str:
+    """The Markdown of a template, in which lines with nothing but tags leave none."""
+    lines = _environment().overlay(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
+    return lines.get_template(name).render(**facts)
+
+
 @cache
 def _environment() -> Environment:
     """Templates with their filters; a name that a template misses is an error."""
@@ -89,6 +95,7 @@ def _environment() -> Environment:
         "symbol": _symbol,
         "unit": _unit,
         "each": _each,
+        "listed": _listed,
     }
     environment.globals |= {"heads": heads, "zip": zip, "estimate_words": estimate_words}
     environment.globals |= {"covariance_words": covariance_words, "formula": formula}
@@ -131,3 +138,8 @@ def percent(share: float, digits: int = 0) -> str:
 def _each(values: Any, form: str | None = None) -> str:
     """Numbers of an array in a row, each by its form, or with four significant digits."""
     return ", ".join(number(v) if form is None else form % v for v in np.ravel(values))
+
+
+def _listed(names: Iterable[str | None]) -> str:
+    """Names in quotation marks, in a row."""
+    return ", ".join(f'"{name}"' for name in names)
