@@ -2,23 +2,33 @@
 
 import contextlib
 import importlib
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hilbo.cli.terminal.console import Force, Json, Out, finish, progress, remark, results, seed_option, start
+from hilbo.cli.terminal.console import Force, Json, Out, Say, finish, progress, remark, results, seed_option, start
 from hilbo.errors import InputError, warn_caller
-from hilbo.population.rules.registry import GIVEN, RECIPES, RULES
+from hilbo.population.rules.registry import GIVEN, RECIPES
 from hilbo.report.figures.painter import begin_painter
+
+if TYPE_CHECKING:
+    import numpy as np
+    import xarray as xr
+
+    from hilbo.study.analysis.cohort_results import CohortResults
+    from hilbo.study.cohort import Cohort
+    from hilbo.study.config import Study
+    from hilbo.study.estimate.distributed import Crew
+    from hilbo.study.formats.json_file import Content
 
 __all__ = ["aggregate", "aggregate_cohort", "read_cohort", "robustness"]
 
 # What draws and writes, loaded beside the arithmetic. Packages that the arithmetic never imports, because two threads
 # that import one package at once may see half of it.
 _DRAW_AND_WRITE = ("matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2")
-_LARGE = 1000  # participants: above, posteriors are not kept, and what costs a fit of everybody is left out
 
 StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
 Table = Annotated[
@@ -65,9 +75,12 @@ def aggregate(
     if not distributed:
         begin_painter()
     start(devices)
+    import jax
+
     from hilbo.study.estimate.distributed import crew, digest
     from hilbo.study.estimate.learnt import by_rule
 
+    content: Content = {}
     with crew(distributed, coordinator, processes, process_id) as team, contextlib.ExitStack() as held:
         say = held.enter_context(progress(quiet=not team.writes))
         with team.agreement() as agree:
@@ -79,12 +92,13 @@ def aggregate(
             chosen = chosen if rule is None else by_rule(chosen, rule)
             cohort = cohort.first(first) if first else cohort
             agree(digest(chosen.file.content, chosen.rule, seed, individuals, cohort))
-        if _at_once(chosen.rule, len(cohort.names), team.devices, individuals, compare):
-            content = aggregate_cohort(chosen, cohort, folder, seed, say, compare=compare, left_out=left_out)
+            whole = _whole(len(cohort.names), jax.device_count(), individuals, compare)
+        if whole:
+            population, grid = _analysed(chosen, cohort, seed, say), None
         else:
-            if RULES[chosen.rule].learns_share and team.writes:
-                remark("The hierarchical rule is taken person by person at each point here; the exact map may differ.")
-            content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say, left_out)
+            population, grid = _analysed_together(chosen, cohort, seed, say, team, individuals)
+        if folder is not None:
+            content = _written(population, folder, say, compare=compare, left_out=left_out, grid=grid)
     if team.writes:
         finish(content, out, as_json, say.printed)
 
@@ -173,22 +187,34 @@ def _included(study, everybody) -> tuple[Any, list[str]]:
     return cohort, sentences
 
 
-def _at_once(rule: str, people: int, devices: int, individuals: bool, compare: bool) -> bool:
-    """Whether everybody's posterior is kept, with everybody's own optimum; otherwise people are merged as a stream.
-    Raises `InputError` where --compare asks for what a stream does not have."""
-    few = devices == 1 and people <= _LARGE
-    if few and not individuals and RULES[rule].joint:
-        remark(f'Everybody\'s own optimum is sought, too: the rule "{rule}" takes all answers at once.')
-        return True
-    if compare and not (few and individuals):
-        raise InputError(f"--compare is for up to {_LARGE:,} people on one device, with their own optima.")
-    return few and individuals
+def _whole(people: int, devices: int, individuals: bool, compare: bool) -> bool:
+    """Whether optima after fewer trials, the region and the model check are computed, too. Raises `InputError` where
+    --compare asks for what is left out."""
+    from hilbo.study.estimate.aggregate import MANY
+
+    whole = individuals and people <= MANY and devices == 1
+    if compare and not whole:
+        raise InputError(f"--compare is for up to {MANY:,} people on one device, with their own optima.")
+    return whole
 
 
 def aggregate_cohort(
-    study, cohort, folder, seed, say, truth=None, compare=False, selection="", left_out=()
-) -> dict[str, Any]:
-    """The results folder of one cohort; with `compare` every rule beside, each person left out in turn."""
+    study: "Study",
+    cohort: "Cohort",
+    folder: Path,
+    seed: int,
+    say: Say,
+    truth: "np.ndarray | None" = None,
+    selection: str = "",
+) -> "Content":
+    """The results folder of one cohort."""
+    return _written(_analysed(study, cohort, seed, say), folder, say, truth=truth, selection=selection)
+
+
+def _analysed(
+    study: "Study", cohort: "Cohort", seed: int, say: Say, *, whole: bool = True, individuals: bool = True
+) -> "CohortResults":
+    """What the answers say."""
     from hilbo.study.analysis.cohort_results import analyse_cohort
 
     with ThreadPoolExecutor(1) as other_core:
@@ -197,28 +223,45 @@ def aggregate_cohort(
             say.tell(sentences)
             other_core.submit(list, map(importlib.import_module, _DRAW_AND_WRITE))
 
-        population = analyse_cohort(study, cohort, seed, say, report_early)
+        return analyse_cohort(study, cohort, seed, say, report_early, whole=whole, individuals=individuals, count=say)
+
+
+def _analysed_together(
+    study: "Study", cohort: "Cohort", seed: int, say: Say, team: "Crew", individuals: bool
+) -> "tuple[CohortResults, xr.Dataset]":
+    """What the answers say and the map's grid, by all devices of all processes: as arrays of this process."""
+    from hilbo.numerics.sharding import host_local
+    from hilbo.report.results import population_grid
+
+    with team.sharded():
+        population = _analysed(study, cohort, seed, say, whole=False, individuals=individuals)
+        say("the population map on a grid")
+        grid = population_grid(population)
+    return host_local(population), grid
+
+
+def _written(
+    population: "CohortResults",
+    folder: Path,
+    say: Say,
+    *,
+    truth: "np.ndarray | None" = None,
+    compare: bool = False,
+    selection: str = "",
+    left_out: Sequence[str] = (),
+    grid: "xr.Dataset | None" = None,
+) -> "Content":
+    """The results folder of one cohort; with `compare` every rule beside, each person left out in turn."""
     from hilbo.report.results import write_results
 
-    beside: dict[str, Any] = {}
+    study, beside = population.study, {}
     if compare:
         from hilbo.report.study.comparison import write_comparison
         from hilbo.study.analysis.rule_comparison import compare as compare_rules
 
         say("every rule, with each person left out")
-        rules = compare_rules(study, population.aggregate, seed)
+        rules = compare_rules(study, population.aggregate, population.seed)
         compared = write_comparison(study, population.aggregate, rules, folder)
         beside = {"comparison": compared.section, "pictures": compared.pictures}
-    return write_results(population, folder, truth, say, left_out=left_out, selection=selection, **beside)
-
-
-def _aggregate_population(study, cohort, team, folder, seed, individuals, say, left_out=()) -> dict[str, Any]:
-    """As `aggregate_cohort` for a large cohort or several devices: by the whole crew, of which one process writes."""
-    from hilbo.report.large_population import population_map, write_population
-    from hilbo.study.estimate.batch_optimum import aggregate_population
-
-    if RULES[study.rule].learns:
-        say("learning the hyperparameters from all answers")
-    large = aggregate_population(study, cohort, team, seed, individuals=individuals, say=say)
-    grid = population_map(large.study, large)
-    return {} if folder is None else write_population(large.study, large, grid, folder, seed, say, left_out)
+    shown = {"left_out": left_out, "selection": selection, "grid": grid} | beside
+    return write_results(population, folder, truth, say, **shown)

@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 
 from hilbo.numerics.compiling import compiler_options
+from hilbo.numerics.sharding import devices, replicated
 
 __all__ = ["Keeper", "OfArrays", "arrays_in", "keep_with", "prepared", "program", "traced_once"]
 
@@ -40,15 +41,19 @@ def keep_with(keeper: Keeper | None) -> None:
 
 def program(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Decorator: compiled as by `eqx.filter_jit`, and kept from one process to the next where a command has set a
-    keeper. Within another trace it is a part of that program. Its results have types of their own, no weak ones."""
+    keeper. Within another trace it is a part of that program. Its results have types of their own, no weak ones; where
+    people are sharded over several devices, each device has a copy of them, and no program is kept."""
     typed = _typed(function)
-    compiled = eqx.filter_jit(typed)
+    compiled, copied = eqx.filter_jit(typed), eqx.filter_jit(_copied(typed))
 
     @functools.wraps(function)
     def call(*args, **kwargs):
-        arrays = arrays_in((args, kwargs)) if _keepers else ()
-        if not _keepers or any(isinstance(array, Tracer) for array in arrays):
+        keeps, several = bool(_keepers), devices() > 1
+        arrays = arrays_in((args, kwargs)) if keeps or several else ()
+        if any(isinstance(array, Tracer) for array in arrays) or not (keeps or several):
             return compiled(*args, **kwargs)
+        if several:
+            return copied(*args, **kwargs)
         kept = _keepers[0](typed, args, kwargs)
         return compiled(*args, **kwargs) if kept is None else kept(arrays)
 
@@ -94,6 +99,17 @@ def _typed(function: Callable) -> Callable:
         return jax.tree.map(_strong, function(*args, **kwargs))
 
     return typed
+
+
+def _copied(function: Callable) -> Callable:
+    """The function with results of which each device has a copy."""
+
+    @functools.wraps(function)
+    def copied(*args, **kwargs):
+        arrays, rest = eqx.partition(function(*args, **kwargs), eqx.is_array)
+        return eqx.combine(replicated(arrays), rest)
+
+    return copied
 
 
 def _strong(leaf: Any) -> Any:

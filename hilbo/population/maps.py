@@ -85,9 +85,10 @@ class RuleMap(eqx.Module):
         if self.method == "exact":
             assert self.shared is not None
             return self.shared.predict(x)
-        means, explained = jax.vmap(lambda person: person.predict_explained(x))(self.experts)
-        share = self.share if RULES[self.rule].learns_share else None
-        return pointwise.aggregate(self.rule, means, explained, self.prior, share=share)
+        assert self.experts is not None
+        return pointwise.merged(
+            self.rule, self.experts, x, self.prior, self.share if RULES[self.rule].learns_share else None
+        )
 
     def astype(self, dtype: DTypeLike) -> "RuleMap":
         """The same map that predicts in another precision."""

@@ -14,13 +14,13 @@ cov(g) = p k, cov(h_j) = (1 - p) k, point by point: of e_j's precision only a pa
 h_j is noise to it. p = 1 is the Bayesian committee machine, which says that people do not differ. `average` is the
 plain mean of the latents, in which everybody counts the same.
 
-The sums may be made at once (`aggregate`), or of blocks of people that are added up (`hilbo.study.estimate.batch`).
-Reference: Tresp (2000). Products of experts, rbcm and grbcm were better on no population
+The sums are made of predictions (`aggregate`), or of posteriors, person by person and on any number of devices
+(`merged`). Reference: Tresp (2000). Products of experts, rbcm and grbcm were better on no population
 (docs/methods/aggregation.md).
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -28,25 +28,29 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo import bcm
 from hilbo.errors import InputError
+from hilbo.numerics.sharding import sum_over_people
 from hilbo.numerics.tracing import traced_once
+from hilbo.ordinal_gp import Posterior
 from hilbo.population.rules.registry import POINTWISE, RULES
 
-__all__ = ["Sums", "aggregate", "terms"]
+__all__ = ["aggregate", "merged"]
 
 
-class Sums(NamedTuple):
-    """Sums over people at points (m,), or derivatives of those sums with further axes; arrays of JAX or NumPy."""
+class _Sums(NamedTuple):
+    """Sums over people at points (m,)."""
 
-    added: Any
+    added: Float[Array, " m"]
     """Precision that people add to the prior."""
-    weighted: Any
+    weighted: Float[Array, " m"]
     """Precision-weighted means."""
-    means: Any
-    explained: Any
+    means: Float[Array, " m"]
+    explained: Float[Array, " m"]
 
-    def merge(self, prior: Any, people: Any, rule: str = "bcm", share: Any = 1.0) -> tuple[Any, Any]:
-        """Mean and variance of the map of so many people with the prior variance `prior`, by the rule that the sums
-        were made for; all of them serve the average."""
+    def merge(
+        self, prior: Float[Array, " m"], people: ArrayLike, rule: str, share: ArrayLike
+    ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of the map of so many people with the prior variance `prior`, by the rule that the
+        sums were made for; all of them serve the average."""
         if not RULES[rule].weighted:
             return self.means / people, (prior - self.explained / people) / people
         common = prior * share
@@ -54,15 +58,35 @@ class Sums(NamedTuple):
         return variance * self.weighted, variance
 
 
-def terms(
+def _terms(
     means: Float[Array, "*s"], explained: Float[Array, "*s"], prior: Float[Array, "..."], share: ArrayLike
-) -> Sums:
+) -> _Sums:
     """What each person adds to the sums; `share`: p, a scalar, 1 for every rule but the hierarchical one.
 
     `means` and `explained` of any shape, and the sums of the same.
     """
     remaining = prior - share * explained
-    return Sums(explained / (prior * remaining), means / remaining, means, explained)
+    return _Sums(explained / (prior * remaining), means / remaining, means, explained)
+
+
+def merged(
+    rule: str, experts: Posterior, x: Float[Array, "m d"], prior_variance: ArrayLike, share: ArrayLike | None = None
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Mean and variance (m,) of the population map at points (m, d) of the unit cube, as `aggregate`, from posteriors.
+
+    `experts`: posteriors of all people, stacked. Their predictions are made one after the other and never held at once,
+    on each of the devices that people are sharded over.
+    """
+    prior = jnp.broadcast_to(jnp.asarray(prior_variance, x.dtype), x.shape[:1])
+    common_share = jnp.ones((), x.dtype) if share is None else jnp.asarray(share, x.dtype)
+    sums = sum_over_people(_terms_of_person, experts, x, prior, common_share)
+    return sums.merge(prior, jnp.asarray(experts.trials.mask.shape[0], x.dtype), rule, common_share)
+
+
+def _terms_of_person(
+    person: Posterior, x: Float[Array, "m d"], prior: Float[Array, " m"], share: Float[Array, ""]
+) -> _Sums:
+    return _terms(*person.predict_explained(x), prior, share)
 
 
 def aggregate(
@@ -110,7 +134,7 @@ def _aggregated(
     if not RULES[rule].weighted:
         return bcm.average(means, prior[None, :] - explained, mask=mask)
     common_share = jnp.ones((), means.dtype) if share is None else share
-    each = terms(means, explained, prior[None, :], common_share)
+    each = _terms(means, explained, prior[None, :], common_share)
     present = jnp.ones(means.shape[0], bool) if mask is None else mask
-    sums = Sums(*(jnp.sum(jnp.where(present[:, None], leaf, 0.0), axis=0) for leaf in each))
+    sums = _Sums(*(jnp.sum(jnp.where(present[:, None], leaf, 0.0), axis=0) for leaf in each))
     return sums.merge(prior, jnp.sum(present, dtype=means.dtype), rule, common_share)

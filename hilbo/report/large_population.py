@@ -1,25 +1,22 @@
-"""The results folder of a large population: what the report of a small one has, as far as it pays.
+"""Grid and figures of a map whose every point asks many participants: the grid is coarse, and figures are read from it.
 
-The map's grid is coarser, and the figures of progress are left out: each of their points is a fit of everybody.
+Figures of progress are left out: each of their points is a fit of everybody.
 """
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import xarray as xr
+from jaxtyping import Float
 from scipy.interpolate import RegularGridInterpolator
 
-from hilbo.report.page import results_page
-from hilbo.report.participants import people_of
-from hilbo.report.results import result, save_figures, write_numbers
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.estimate.batch_optimum import LargeAggregate
-from hilbo.study.formats.json_file import Content
-from hilbo.study.results.map_netcdf import map_dataset, on_grid
+from hilbo.study.estimate.aggregate import Aggregate
+from hilbo.study.results.map_netcdf import on_grid
 
-__all__ = ["population_map", "write_population"]
+__all__ = ["coarse_cells", "figures_of_many"]
 
 _POINTS = 5000  # of the map's grid
 _CELLS = 41
@@ -27,36 +24,13 @@ _DRAWN = 200  # participants whose answers the figure shows
 _DOTS = 2000  # individual optima in a figure
 
 
-def population_map(study: Study, large: LargeAggregate) -> xr.Dataset:
-    """The map on a grid of at most 5,000 points, or at as many: a pass over all people, by the whole crew."""
-    cells = min(_CELLS, int(_POINTS ** (1 / min(study.space.dim, 3))))
-    return map_dataset(study, large.surface, cells)
+def coarse_cells(study: Study) -> int:
+    """Cells along each side of a grid of at most 5,000 points."""
+    return min(_CELLS, int(_POINTS ** (1 / min(study.space.dim, 3))))
 
 
-def write_population(
-    study: Study,
-    large: LargeAggregate,
-    grid: xr.Dataset,
-    folder: Path,
-    seed: int = 0,
-    say=lambda text: None,
-    left_out: Sequence[str] = (),
-) -> Content:
-    """Write result.json, optima.csv, map.nc, figures and report.html; returns the content of result.json. `left_out`:
-    sentences on who is not in it."""
-    people = people_of(study, large)
-    content = result(study, large, seed, None, people, left_out)
-    say("writing results")
-    write_numbers(content, people, grid, folder)
-    say("figures and report")
-    figures, drawn = _figures(study, large, grid)
-    page = results_page(study, content, save_figures(figures, folder), people, drawn=drawn)
-    (folder / "report.html").write_text(page, encoding="utf-8")
-    return content
-
-
-def _figures(study, aggregate, grid):
-    """Name -> figure, and how many participants and individual optima they show."""
+def figures_of_many(study: Study, aggregate: Aggregate, grid: xr.Dataset) -> tuple[dict[str, Any], dict[str, int]]:
+    """Figures by their names, and how many `participants` and individual `optima` they show. `grid`: of the map."""
     from hilbo.report.figures import maps
 
     figures, best, drawn = {}, np.asarray(aggregate.optimum.x), {}
@@ -64,8 +38,8 @@ def _figures(study, aggregate, grid):
         subset = _some(aggregate.cohort)
         figures["map"] = maps.map_slices(study, _from(grid), best, subset)
         drawn["participants"] = len(subset.names)
-    if aggregate.individuals is not None and study.space.dim > 1:
-        x = np.asarray(aggregate.individuals.x)
+    if aggregate.own is not None and study.space.dim > 1:
+        x = np.asarray(aggregate.own.x)
         rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), _DOTS)).round().astype(int))
         marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)}
         figures["optima"] = maps.optima_scatter(study, x[rows], marks)
@@ -75,18 +49,17 @@ def _figures(study, aggregate, grid):
 
 def _some(cohort: Cohort) -> Cohort:
     """A few participants, evenly chosen."""
-    rows = np.unique(np.linspace(0, len(cohort.names) - 1, _DRAWN).round().astype(int))
-    return cohort.rows(rows)
+    people = len(cohort.names)
+    return cohort.rows(np.unique(np.linspace(0, people - 1, min(people, _DRAWN)).round().astype(int)))
 
 
-def _from(grid):
+def _from(grid: xr.Dataset) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     """The map between the grid's points, to what a figure shows: mean and variance at points of the unit cube."""
-    shape = grid["mean"].shape
-    sides = tuple(np.linspace(0.0, 1.0, count) for count in shape)
+    sides = tuple(np.linspace(0.0, 1.0, count) for count in grid["mean"].shape)
     values = np.stack([grid["mean"].values, grid["variance"].values], axis=-1)
     between = RegularGridInterpolator(sides, values, method="cubic")
 
-    def surface(x):
+    def surface(x: Float[np.ndarray, "m d"]) -> tuple[np.ndarray, np.ndarray]:
         values = between(np.asarray(x))
         return values[:, 0], values[:, 1]
 

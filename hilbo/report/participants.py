@@ -62,8 +62,8 @@ class People(NamedTuple):
 
 
 def people_of(study: Study, aggregate: Any) -> People:
-    """The participants of an `Aggregate` or of a `LargeAggregate`."""
-    individuals = aggregate.individuals
+    """The participants of an `Aggregate`."""
+    individuals = aggregate.own
     sets, margins = (None, None) if individuals is None else parameter_sets(study, np.asarray(individuals.x))
     cohort = aggregate.cohort
     optima = (

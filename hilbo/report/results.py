@@ -20,6 +20,7 @@ import xarray as xr
 from jaxtyping import Array, Float
 
 from hilbo.report.figures.painter import write_figures
+from hilbo.report.large_population import coarse_cells, figures_of_many
 from hilbo.report.page import Pictures, results_page
 from hilbo.report.participants import People, people_of
 from hilbo.report.result_file import write_result
@@ -31,13 +32,12 @@ from hilbo.study.analysis.heterogeneity import heterogeneity, in_place, rule_war
 from hilbo.study.analysis.model_check import check_sentences
 from hilbo.study.analysis.region import Region, region_content, region_sentences
 from hilbo.study.config import Study
-from hilbo.study.estimate.aggregate import Aggregate, asked_variance, other_inference
-from hilbo.study.estimate.batch_optimum import LargeAggregate
+from hilbo.study.estimate.aggregate import MANY, Aggregate, asked_variance, other_inference
 from hilbo.study.estimate.learnt import effect_content, learnt_content, learnt_sentences
 from hilbo.study.estimate.location import location_notes, location_sentences
 from hilbo.study.estimate.optimum import Optimum
 from hilbo.study.formats.json_file import Content
-from hilbo.study.results.map_netcdf import map_dataset, on_grid, write_map
+from hilbo.study.results.map_netcdf import CELLS, map_dataset, on_grid, write_map
 
 __all__ = [
     "cohort_content",
@@ -45,6 +45,7 @@ __all__ = [
     "moved",
     "optima_table",
     "optimum_content",
+    "population_grid",
     "result",
     "save_figures",
     "versions",
@@ -83,7 +84,7 @@ def versions() -> dict[str, str]:
 
 def result(
     study: Study,
-    aggregate: Aggregate | LargeAggregate,
+    aggregate: Aggregate,
     seed: int,
     truth: Float[np.ndarray, " d"] | None = None,
     people: People | None = None,
@@ -94,18 +95,18 @@ def result(
 ) -> Content:
     """The content of result.json. `left_out`: sentences on who is not in it; `region`, `check`: of `CohortResults`."""
     people = people_of(study, aggregate) if people is None else people
-    best, whole = aggregate.optimum, None if isinstance(aggregate, LargeAggregate) else aggregate
+    best = aggregate.optimum
     content = {
         "optimum": optimum_content(study, best) | {"location": _location(study, aggregate, study.rule, best)},
-        "participants": people if whole is None else list(people.entries()),
+        "participants": list(people.entries()) if len(people.names) <= MANY else people,
         "alternatives": {
             name: optimum_content(study, optimum) | {"location": _location(study, aggregate, name, optimum)}
             for name, optimum in aggregate.alternatives.items()
         },
-        "mean_of_optima": _mean_of_optima(study, aggregate.mean_of_optima),
+        "mean_of_optima": None if aggregate.own is None else _mean_of_optima(study, aggregate.mean_of_optima),
         "rule": study.rule,
         "learnt": learnt_content(study, people.names),
-        "random_effect": None if whole is None else _random_effect(study, whole),
+        "random_effect": _random_effect(study, aggregate),
         "heterogeneity": heterogeneity(aggregate),
         "inference": study.inference,
         "study": study.file.hash,
@@ -116,7 +117,7 @@ def result(
     if other in aggregate.alternatives:
         content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
     warnings = [*left_out, *_not_converged(people), *rule_warnings(study, aggregate), *learnt_sentences(study)]
-    warnings += location_sentences(study, best.x, best.sd, None if whole is None else whole.asked_variance)
+    warnings += location_sentences(study, best.x, best.sd, aggregate.asked_variance)
     content["warnings"] = warnings + region_sentences(region) + check_sentences(check)
     content["optimum_region"] = region_content(study, region)
     content["model_check"] = check
@@ -132,18 +133,16 @@ def _random_effect(study: Study, aggregate: Aggregate) -> Content | None:
     return None if map_ is None else effect_content(study, aggregate.cohort, map_)
 
 
-def _mean_of_optima(study: Study, mean: Float[Array, " d"] | None) -> Content | None:
-    """The mean of everybody's own optimum, which nobody was asked about; None where no optimum was sought."""
-    if mean is None:
-        return None
+def _mean_of_optima(study: Study, mean: Float[Array, " d"]) -> Content:
+    """The mean of everybody's own optimum, which nobody was asked about."""
     rendering = Rendering.at(study.space, mean)
     return {"parameters": rendering.shown, "passivity_margin": rendering.margin}
 
 
-def _location(study: Study, aggregate: Aggregate | LargeAggregate, name: str, optimum: Optimum) -> list[str]:
+def _location(study: Study, aggregate: Aggregate, name: str, optimum: Optimum) -> list[str]:
     """What is to be known of where an optimum lies, by the map of its own that `name` says."""
-    map_ = None if isinstance(aggregate, LargeAggregate) else aggregate.maps.get(name)
-    asked = None if isinstance(aggregate, LargeAggregate) or map_ is None else asked_variance(map_, aggregate.cohort)
+    map_ = aggregate.maps.get(name)
+    asked = None if map_ is None else asked_variance(map_, aggregate.cohort)
     return location_notes(study, optimum.x, optimum.sd, asked)
 
 
@@ -229,23 +228,33 @@ def write_results(
     selection: str = "",
     comparison: Content | None = None,
     pictures: Pictures | None = None,
+    grid: xr.Dataset | None = None,
 ) -> Content:
     """Write the results folder; returns the content of result.json.
 
     **Arguments:** `say` is told what is being done; `left_out`: sentences on who is not in it; `selection`,
-    `comparison`: as `page.results_page`, whose further `pictures` are those of the comparison.
+    `comparison`: as `page.results_page`, whose further `pictures` are those of the comparison; `grid`: of
+    `population_grid`, if it was made.
     """
     study, aggregate = population.study, population.aggregate
     people = people_of(study, aggregate)
     content = cohort_content(population, truth, people, left_out)
     say("the population map on a grid")
-    write_numbers(content, people, map_dataset(study, aggregate.surface), folder)
+    grid = population_grid(population) if grid is None else grid
+    write_numbers(content, people, grid, folder)
     say("figures and report")
-    pictures = save_figures(_figures(population, truth), folder) | (pictures or {})
-    shown = {"how": in_place(aggregate.map), "halves": population.progress.splits}
-    page = results_page(study, content, pictures, people, selection=selection, comparison=comparison, **shown)
+    figures, shown = _figures(population, truth, grid)
+    pictures = save_figures(figures, folder) | (pictures or {})
+    how = in_place(aggregate.map)
+    page = results_page(study, content, pictures, people, selection=selection, comparison=comparison, how=how, **shown)
     (folder / "report.html").write_text(page, encoding="utf-8")
     return content
+
+
+def population_grid(population: CohortResults) -> xr.Dataset:
+    """The population map on a grid; a coarse one where everybody is asked at each of its points."""
+    cells = CELLS if population.following is not None else coarse_cells(population.study)
+    return map_dataset(population.study, population.aggregate.surface, cells)
 
 
 def cohort_content(
@@ -288,13 +297,18 @@ def optima_table(content: Content, people: People) -> pd.DataFrame:
     return pd.concat([pd.DataFrame(rows), people.table()])
 
 
-def _figures(population: CohortResults, truth: Float[np.ndarray, " d"] | None) -> dict[str, Any]:
-    """Name -> figure."""
+def _figures(
+    population: CohortResults, truth: Float[np.ndarray, " d"] | None, grid: xr.Dataset
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Figures by their names, and what else `results_page` is told of them."""
     from hilbo.report.figures import maps
     from hilbo.report.figures.effects import effects_figure
     from hilbo.report.figures.progress import progress_figure
 
     study, aggregate = population.study, population.aggregate
+    if population.following is None:
+        figures, drawn = figures_of_many(study, aggregate, grid)
+        return figures, {"drawn": drawn}
     best = np.asarray(aggregate.optimum.x)
     figures = {
         "map": maps.map_slices(study, aggregate.surface, best, population.cohort),
@@ -307,4 +321,4 @@ def _figures(population: CohortResults, truth: Float[np.ndarray, " d"] | None) -
         marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)}
         marks |= {} if truth is None else {"truth": truth}
         figures["optima"] = maps.optima_scatter(study, np.asarray(aggregate.individuals.x), marks)
-    return figures
+    return figures, {"halves": population.progress.splits}

@@ -1,10 +1,12 @@
 """Whose answers, and which material's, `hilbo aggregate` takes from a table."""
 
+import contextlib
+
 import pandas as pd
 import pytest
 from studies import PLAIN, plain
 
-from hilbo.cli.aggregate import _at_once, _included, read_cohort
+from hilbo.cli.aggregate import _included, _whole, read_cohort
 from hilbo.errors import InputError
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
@@ -77,25 +79,10 @@ def test_whom_the_study_leaves_out_is_not_aggregated(capsys):
 
 
 @pytest.mark.parametrize(
-    ("rule", "people", "devices", "individuals", "at_once"),
-    [
-        ("bcm", 24, 1, True, True),
-        ("bcm", 1001, 1, True, False),
-        ("bcm", 24, 2, True, False),
-        ("bcm", 24, 1, False, False),
-        ("average", 24, 1, False, False),
-        ("hierarchical", 24, 1, False, True),  # a sum over people is another rule
-        ("learnt-2", 24, 1, False, True),
-    ],
+    ("people", "devices", "individuals", "whole"),
+    [(1000, 1, True, True), (1001, 1, True, False), (24, 2, True, False), (24, 1, False, False)],
 )
-def test_a_rule_that_takes_all_answers_at_once_is_never_taken_as_a_stream(
-    rule, people, devices, individuals, at_once, capsys
-):
-    assert _at_once(rule, people, devices, individuals, compare=False) is at_once
-    assert ("Everybody's own optimum is sought, too" in capsys.readouterr().err) is (at_once and not individuals)
-
-
-@pytest.mark.parametrize(("people", "devices", "individuals"), [(1001, 1, True), (24, 2, True), (24, 1, False)])
-def test_a_stream_of_people_has_no_comparison_of_all_rules(people, devices, individuals):
-    with pytest.raises(InputError, match="--compare is for up to 1,000 people on one device"):
-        _at_once("bcm", people, devices, individuals, compare=True)
+def test_what_costs_another_fit_of_everybody_is_left_out_for_many_people(people, devices, individuals, whole):
+    assert _whole(people, devices, individuals, compare=False) is whole
+    with contextlib.nullcontext() if whole else pytest.raises(InputError, match="--compare is for up to 1,000 people"):
+        assert _whole(people, devices, individuals, compare=True)

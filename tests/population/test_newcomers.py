@@ -28,7 +28,6 @@ from hilbo.study.analysis.progress import _map_by_points
 from hilbo.study.analysis.tolerance_intervals import _dominant_in_draws
 from hilbo.study.cohort import Cohort
 from hilbo.study.estimate.aggregate import Aggregate, fit_cohort
-from hilbo.study.estimate.batch_optimum import _optimum_at, _variance_apart
 from hilbo.study.estimate.optimum import map_optimum, predict_people
 
 STUDY = plain()
@@ -72,13 +71,6 @@ def test_class_probabilities_of_an_optimum_are_a_new_persons(posteriors):
     mean, variance = (float(part[0]) for part in map_.predict(best.x[None, :]))
     np.testing.assert_allclose([best.mean, best.sd], [mean, np.sqrt(variance)], rtol=1e-10)
     np.testing.assert_allclose(best.class_probabilities, chances(mean, variance + 1.0 - SHARE), rtol=1e-9)
-
-
-def test_a_stream_of_people_says_the_same():
-    for rule, apart in (("hierarchical", 1.0 - SHARE), ("average", 0.0)):
-        optimum = _optimum_at(STUDY, np.zeros(2), np.asarray(0.7), np.asarray(0.3), _variance_apart(STUDY, rule, SHARE))
-        np.testing.assert_allclose(optimum.class_probabilities, chances(0.7, 0.3 + apart), rtol=1e-12)
-        assert float(optimum.sd) == pytest.approx(np.sqrt(0.3))
 
 
 def test_draws_of_tolerance_intervals_are_a_new_persons(posteriors):

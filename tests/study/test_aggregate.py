@@ -18,6 +18,7 @@ from hilbo.session.choose.ask_tell import physical_trials
 from hilbo.study.analysis.progress import follow
 from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.config import Study
+from hilbo.study.estimate import aggregate
 from hilbo.study.estimate.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.estimate.optimum import predict_people
 from hilbo.study.tables.trials import write_trials
@@ -189,3 +190,24 @@ def test_a_cohort_has_the_bits_of_its_sessions():
             one = jax.tree.map(lambda leaf, j=j: leaf[j], cohort.trials)
             jax.tree.map(np.testing.assert_array_equal, one, alone)
             np.testing.assert_array_equal(cohort.physical[j, :7], points)
+
+
+def test_a_large_cohort_is_fitted_in_batches_to_the_same_results(monkeypatch):
+    """Above `MANY` people, here two of five: the last batch is filled up, and nothing of that is left."""
+    cohort, counted = cohort_of(table(5), STUDY), []
+    whole = aggregate_cohort(STUDY, cohort, alternatives=False)
+    assert whole.asked_variance is not None
+    monkeypatch.setattr(aggregate, "MANY", 2)
+    parts = aggregate_cohort(STUDY, cohort, alternatives=False, say=lambda *what: counted.append(what[1:]))
+    np.testing.assert_allclose(parts.optimum.x, whole.optimum.x, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(parts.individuals.x, whole.individuals.x, rtol=0, atol=1e-7)
+    assert parts.posteriors.trials.mask.shape == whole.posteriors.trials.mask.shape
+    assert counted == [(2, 5), (4, 5), (5, 5)] * 2
+    assert parts.asked_variance is None
+
+
+def test_optima_that_were_not_sought_are_missed_in_a_sentence():
+    found = aggregate_cohort(STUDY, cohort_of(table(), STUDY), alternatives=False, individuals=False)
+    assert found.own is None
+    with pytest.raises(InputError, match="was not sought; aggregate with individuals=True"):
+        _ = found.mean_of_optima

@@ -41,14 +41,14 @@ space_filling = 2
 MAIN = "from hilbo.cli.main import main; main()"
 DIES = """
 import os, signal
-import hilbo.study.estimate.batch_optimum
-hilbo.study.estimate.batch_optimum.aggregate_population = lambda *args, **more: os.kill(os.getpid(), signal.SIGKILL)
+import hilbo.study.analysis.cohort_results
+hilbo.study.analysis.cohort_results.analyse_cohort = lambda *args, **more: os.kill(os.getpid(), signal.SIGKILL)
 """
 FAILS = """
-import hilbo.study.estimate.batch_optimum
+import hilbo.study.analysis.cohort_results
 def fail(*args, **more):
     raise MemoryError("no room")
-hilbo.study.estimate.batch_optimum.aggregate_population = fail
+hilbo.study.analysis.cohort_results.analyse_cohort = fail
 """
 
 

@@ -23,10 +23,7 @@ from hilbo.simulation.simulate import people
 from hilbo.study.analysis.hills import hills_of
 from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.config import Study
-from hilbo.study.estimate import distributed
 from hilbo.study.estimate.aggregate import aggregate_cohort
-from hilbo.study.estimate.batch import refit, streamed_cohort
-from hilbo.study.estimate.batch_optimum import optima_from
 from hilbo.study.estimate.learnt import that_learns
 from hilbo.study.formats.json_file import check_values
 from hilbo.study.tables.trials import write_trials
@@ -249,16 +246,3 @@ def test_a_table_of_levels_that_was_read_and_shortened_is_checked_again(tmp_path
     np.testing.assert_array_equal(half.physical[0, :9], whole.physical[0, :9])
     with pytest.raises(InputError, match=r'texture is "7\.0"; it must be one of silk, wood, stone'):
         cohort_of(read.assign(texture=7.0), study)
-
-
-@pytest.mark.deep  # it compiles the search of many people
-def test_a_streamed_optimum_tries_the_other_levels():
-    study = surfaces()
-    cohort = cohort_of(pd.concat([answers(), answers().assign(participant="B")]), study)
-    points = np.asarray(study.space.candidates(300, 0))
-    best = aggregate_cohort(study, cohort, alternatives=False).optimum
-    elsewhere = points[points[:, 1] != float(best.x[1])]
-    fitted = refit(streamed_cohort(study, cohort, distributed.alone()), elsewhere, False)
-    optimum = optima_from(fitted.population, elsewhere, fitted.sums)["bcm"]
-    assert float(optimum.x[1]) == float(best.x[1])
-    assert float(optimum.mean) == pytest.approx(float(best.mean), abs=1e-6)

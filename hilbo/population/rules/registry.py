@@ -60,7 +60,7 @@ class Rule:
 
     @property
     def product(self) -> bool:
-        """Whether the map is a product of people's posteriors: it may be made as a stream, and has joint draws."""
+        """Whether the map is a product of people's posteriors, which has joint draws."""
         return self.by_points and self.weighted and not self.learns_share
 
     @property

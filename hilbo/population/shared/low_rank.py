@@ -21,8 +21,9 @@ Snelson & Ghahramani (2007), AISTATS, for what is kept within a block; Harbrecht
 Numerical Mathematics 62:428, for the factorisation.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -33,6 +34,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from hilbo.gaussian import distance, residual_tolerance
 from hilbo.kernels import gram
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.sharding import of_each_person, sharded
 from hilbo.population.shared.features import Pivots, features_of
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.tallies import Expansion, Tallies, expand_counts
@@ -64,9 +66,9 @@ class LowRankPrior(NamedTuple):
     blocks: Float[Array, "M n n"]
 
     def times(self, weights: Float[Array, "M n"]) -> Float[Array, "M n"]:
-        """K a."""
+        """K a, and the rows of a sharded as those of K are."""
         together = jnp.einsum("jnr,jn->r", self.features, weights)
-        return self.features @ together + jnp.einsum("jnm,jm->jn", self.blocks, weights)
+        return sharded(self.features @ together + jnp.einsum("jnm,jm->jn", self.blocks, weights))
 
 
 class System(NamedTuple):
@@ -79,38 +81,46 @@ class System(NamedTuple):
 
     def solve(self, right: Float[Array, "M n"]) -> Float[Array, "M n"]:
         """(K + W^-1)^-1 y, which needs no W^-1."""
-        first = jax.lax.map(lambda p: solve_triangular(p[0], p[1], lower=True), (self.lower, self.root * right))
+        first = _each(lambda p: solve_triangular(p[0], p[1], lower=True), (self.lower, self.root * right))
         together = jax.scipy.linalg.cho_solve((self.factor, True), jnp.einsum("jnr,jn->r", self.half, first))
         rest = first - self.half @ together
-        return self.root * jax.lax.map(lambda p: solve_triangular(p[0], p[1], lower=True, trans=1), (self.lower, rest))
+        return self.root * _each(lambda p: solve_triangular(p[0], p[1], lower=True, trans=1), (self.lower, rest))
+
+
+def _each(function: Callable[..., Any], people: PyTree, *shared: Any) -> Any:
+    """`function(person, *shared)` for all people, one after the other on each device."""
+
+    def some(people, *shared):
+        return jax.lax.map(lambda person: function(person, *shared), people)
+
+    return of_each_person(some, people, *shared)
 
 
 def prior_of(model: PeopleModel, answers: Tallies, pivots: Pivots) -> LowRankPrior:
-    kernel = model.unit
-    unit = features_of(kernel, pivots, answers.x)
+    unit = of_each_person(lambda x, kernel, pivots: features_of(kernel, pivots, x), answers.x, model.unit, pivots)
 
-    def block(person):
+    def block(person, kernel, own, shared):
         x, own_features = person
         covariance = gram(kernel, x, x)
-        return model.own * covariance + model.shared * (covariance - own_features @ own_features.T)
+        return own * covariance + shared * (covariance - own_features @ own_features.T)
 
     features = jnp.sqrt(model.shared) * unit
     if model.effect is not None:
         of_context = jax.nn.one_hot(answers.context, answers.contexts, dtype=unit.dtype)
         features = jnp.concatenate([features, jnp.sqrt(model.effect) * of_context], axis=-1)
-    return LowRankPrior(features, jax.lax.map(block, (answers.x, unit)))
+    return LowRankPrior(sharded(features), _each(block, (answers.x, unit), model.unit, model.own, model.shared))
 
 
 def system_at(prior: LowRankPrior, curvature: Float[Array, "M n"]) -> System:
     answered = curvature > 0
     root = jnp.where(answered, jnp.sqrt(jnp.where(answered, curvature, 1.0)), 0.0)
-    unit = jnp.eye(root.shape[1], dtype=root.dtype)
 
-    def person(block, features, root):
-        lower = jnp.linalg.cholesky(unit + root[:, None] * block * root[None, :])
+    def person(prior_and_root):
+        block, features, root = prior_and_root
+        lower = jnp.linalg.cholesky(jnp.eye(len(root), dtype=root.dtype) + root[:, None] * block * root[None, :])
         return lower, solve_triangular(lower, root[:, None] * features, lower=True)
 
-    lower, half = jax.lax.map(lambda p: person(*p), (prior.blocks, prior.features, root))
+    lower, half = _each(person, (prior.blocks, prior.features, root))
     flat = half.reshape(-1, half.shape[2])
     precision = jnp.eye(half.shape[2], dtype=root.dtype) + flat.T @ flat
     factor = jnp.linalg.cholesky(precision)
@@ -121,10 +131,13 @@ def system_at(prior: LowRankPrior, curvature: Float[Array, "M n"]) -> System:
 def _expand(model: PeopleModel, answers: Tallies, eta: Float[Array, "M n"]) -> Expansion:
     """Log-likelihood terms, slopes and curvatures of everybody's answers."""
 
-    def person(thresholds, counts, eta):
-        return jax.vmap(partial(expand_counts, OrdinalProbit(thresholds, model.noise)))(eta, counts)
+    def each(some, noise):
+        def person(thresholds, counts, eta):
+            return jax.vmap(partial(expand_counts, OrdinalProbit(thresholds, noise)))(eta, counts)
 
-    return jax.vmap(person)(model.person_thresholds, answers.counts, eta)
+        return jax.vmap(person)(*some)
+
+    return of_each_person(each, (model.person_thresholds, answers.counts, eta), model.noise)
 
 
 # --- the mode

@@ -12,6 +12,7 @@ from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evide
 from hilbo.kernels import Stationary, gram
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.linalg import eigh
+from hilbo.numerics.sharding import of_each_person, sum_over_people
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.shared.features import Pivots, root_of_pivots
@@ -107,14 +108,13 @@ def _weights_at(
 ) -> Float[Array, " r"]:
     """The weights of the pivots, from those of the answers."""
 
-    def of_person(total, person):
+    def of_person(person, pivots):
         x, weights, features = person
         same = jnp.all(x[:, None] == pivots.points[None], axis=2) & pivots.carry[None]
         elsewhere = jnp.where(jnp.any(same, axis=1), 0.0, weights)
-        return jax.tree.map(jnp.add, total, (weights @ same.astype(weights.dtype), elsewhere @ features)), None
+        return weights @ same.astype(weights.dtype), elsewhere @ features
 
-    zero = jnp.zeros_like(root[0])
-    (there, carried), _ = jax.lax.scan(of_person, (zero, zero), (answers.x, weights, features))
+    there, carried = sum_over_people(of_person, (answers.x, weights, features), pivots)
     return there + jnp.where(pivots.used, solve_triangular(root, carried, lower=True, trans=1), 0.0)
 
 
@@ -165,5 +165,9 @@ def _rounding(
 ) -> Float[Array, ""]:
     """What the rounding of everybody's own covariances, and of g's, does to the log evidence."""
     kernel = model.of_variance(model.own)
-    of_people = jax.lax.map(lambda p: evidence_rounding(gram(kernel, p[0], p[0]), p[1][None, :]), (answers.x, weights))
+
+    def each(people, kernel):
+        return jax.lax.map(lambda p: evidence_rounding(gram(kernel, p[0], p[0]), p[1][None, :]), people)
+
+    of_people = of_each_person(each, (answers.x, weights), kernel)
     return jnp.linalg.norm(of_people) + evidence_rounding(covariance, of_pivots[None, :])

@@ -9,13 +9,14 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
+from hilbo.errors import InputError
 from hilbo.population.rules.registry import RULES
 from hilbo.study.analysis.model_check import model_check
 from hilbo.study.analysis.progress import Progress, follow
 from hilbo.study.analysis.region import Region, optimum_region
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort, asked_variance
+from hilbo.study.estimate.aggregate import Aggregate, SayCount, aggregate_cohort, asked_variance
 from hilbo.study.estimate.learnt import resolved
 from hilbo.study.estimate.location import location_sentences, optimum_sentence
 from hilbo.study.formats.json_file import Content
@@ -30,13 +31,13 @@ class CohortResults(NamedTuple):
 
     study: Study
     aggregate: Aggregate
-    following: Future[Progress]
-    """What becomes `progress`: computed beside what is read from the aggregate."""
+    following: Future[Progress] | None
+    """What becomes `progress`: computed beside what is read from the aggregate; None if it was not asked."""
     seed: int
     region: Region | None
-    """Where the optimum is, with its probability; None for a map without a joint posterior."""
+    """Where the optimum is, with its probability; None for a map without a joint posterior, and if it was not asked."""
     check: Content | None
-    """Whether the model fits (`model_check`)."""
+    """Whether the model fits (`model_check`); None if it was not asked."""
 
     @property
     def cohort(self) -> Cohort:
@@ -45,7 +46,9 @@ class CohortResults(NamedTuple):
 
     @property
     def progress(self) -> Progress:
-        """The optima after fewer trials; waits for them."""
+        """The optima after fewer trials; waits for them. Raises `InputError` if they were not asked."""
+        if self.following is None:
+            raise InputError("CohortResults: the optima after fewer trials were not asked; analyse with whole=True.")
         return self.following.result()
 
 
@@ -55,9 +58,17 @@ def analyse_cohort(
     seed: int = 0,
     say: Say = lambda text: None,
     tell: Callable[[list[str]], None] = lambda sentences: None,
+    *,
+    whole: bool = True,
+    individuals: bool = True,
+    count: SayCount = lambda words, done, people: None,
 ) -> CohortResults:
     """The aggregate of a cohort, and its optima after fewer trials, which a thread goes on to compute; everything is
-    fitted once. `tell` is given the optimum in sentences as soon as it is known."""
+    fitted once.
+
+    **Arguments:** `tell`: given the optimum in sentences as soon as it is known; `whole`: False for the aggregate
+    alone, as for many participants; `individuals`, `count`: as `individuals` and `say` of `aggregate_cohort`.
+    """
     if RULES[study.rule].learns:
         say("learning the hyperparameters from all answers")
     study = resolved(study, cohort)
@@ -67,7 +78,9 @@ def analyse_cohort(
         asked = asked_variance(map_, cohort)
         tell([optimum_sentence(study, optimum.x), *location_sentences(study, optimum.x, optimum.sd, asked)])
 
-    aggregate = aggregate_cohort(study, cohort, seed, first=first)
+    aggregate = aggregate_cohort(study, cohort, seed, first=first, individuals=individuals, say=count)
+    if not whole:
+        return CohortResults(study, aggregate, None, seed, None, None)
     say("the optima after fewer trials")
     beside = ThreadPoolExecutor(1, "progress")
     following = beside.submit(follow, study, aggregate, seed)

@@ -4,22 +4,28 @@
     cohort    = cohort_of(table, study)
     aggregate = aggregate_cohort(study, cohort)
 
-All participants are fitted in one compiled batch over trials padded to one capacity. The population map is a
-committee machine over their posteriors (`hilbo.bcm`), or what the study's rule says (`hilbo.population.maps`).
+Participants are fitted in compiled batches over trials padded to one capacity. The population map is a committee
+machine over their posteriors (`hilbo.bcm`), or what the study's rule says (`hilbo.population.maps`). Cohorts of any
+size go this way, on all devices of JAX's current mesh (`hilbo.numerics.sharding`): above `MANY` participants batches
+are of that many, and results that cost another fit of everybody are left out.
 """
 
+import contextlib
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from hilbo.errors import InputError
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.host import to_device
+from hilbo.numerics.sharding import devices, of_each_person
 from hilbo.numerics.shown import has_values
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
@@ -34,12 +40,33 @@ from hilbo.study.config import Inference, Study
 from hilbo.study.estimate.learnt import resolved
 from hilbo.study.estimate.optimum import Optimum, individual_optima, map_optimum, predict_map
 
-__all__ = ["Aggregate", "First", "aggregate_cohort", "asked_variance", "fit_cohort", "other_inference"]
+__all__ = [
+    "MANY",
+    "Aggregate",
+    "First",
+    "SayCount",
+    "aggregate_cohort",
+    "asked_variance",
+    "fit_cohort",
+    "other_inference",
+]
 
+MANY = 1000
+"""Participants of a batch; of a larger cohort, what costs another fit of everybody is left out."""
 _LARGEST_POOL = 3000  # answers of the pooled alternative: its fit is cubic in their number
 
 
+_People = TypeVar("_People", bound=PyTree)
+_Result = TypeVar("_Result", bound=PyTree)
+
 First = Callable[[Optimum, RuleMap], None]
+
+SayCount = Callable[[str, int, int], None]
+"""What was done, for how many participants so far, of how many."""
+
+
+def _silent(words: str, done: int, people: int) -> None:
+    del words, done, people
 
 
 class Surface(eqx.Module):
@@ -58,7 +85,8 @@ class Aggregate(eqx.Module):
     cohort: Cohort
     posteriors: Posterior
     optimum: Optimum
-    individuals: Optimum
+    own: Optimum | None
+    """Everybody's own optimum, stacked; None if it was not sought."""
     alternatives: dict[str, Optimum]
     """Optimum of the plain average of the latent functions, of one GP on all answers (if not too many), by the
     hierarchical rule and by bcm where the study's rule is another, and of the population map by another inference:
@@ -92,8 +120,15 @@ class Aggregate(eqx.Module):
         return {name: np.asarray(getattr(certificate, name)) for name in certificate.__dataclass_fields__}
 
     @property
-    def asked_variance(self) -> Float[Array, ""]:
-        """Largest variance of the map at a point that somebody answered. A scalar."""
+    def individuals(self) -> Optimum:
+        """Everybody's own optimum, stacked. Raises `InputError` if it was not sought."""
+        if self.own is None:
+            raise InputError("Aggregate: everybody's own optimum was not sought; aggregate with individuals=True.")
+        return self.own
+
+    @property
+    def asked_variance(self) -> Float[Array, ""] | None:
+        """Largest variance of the map at a point that somebody answered, a scalar; as `asked_variance`."""
         return asked_variance(self.map, self.cohort)
 
     @property
@@ -123,19 +158,47 @@ def fit_cohort(
 ) -> Posterior:
     """Everybody's posterior, stacked; with the study's model, or with `gps`, one stacked model each; by the study's
     inference, or by another."""
-    inference = study.inference if inference is None else inference
-    return _fit_cohort(study.gp, cohort.trials, inference) if gps is None else _fit_own(gps, cohort.trials, inference)
+    return _fitted(study, cohort, gps, inference, _silent)
+
+
+def _fitted(
+    study: Study, cohort: Cohort, gps: OrdinalGP | None, inference: Inference | None, say: SayCount
+) -> Posterior:
+    """As `fit_cohort`, in batches."""
+    by = study.inference if inference is None else inference
+    if gps is None:
+        return _in_batches(lambda trials: _fit_cohort(study.gp, trials, by), cohort.trials, "participants fitted", say)
+    both = gps, cohort.trials
+    return _in_batches(lambda some: _fit_own(some[0], some[1], by), both, "participants fitted", say)
 
 
 # Programs take what they use: two studies that differ in their words share them.
 @program
 def _fit_cohort(gp: OrdinalGP, trials: Trials, inference: Inference) -> Posterior:
-    return jax.vmap(lambda t: fit(gp, t, inference=inference, throw=False))(trials)
+    def each(trials, gp):
+        return jax.vmap(lambda t: fit(gp, t, inference=inference, throw=False))(trials)
+
+    return of_each_person(each, trials, gp)
 
 
 @program
 def _fit_own(gps: OrdinalGP, trials: Trials, inference: Inference) -> Posterior:
-    return jax.vmap(lambda gp, t: fit(gp, t, inference=inference, throw=False))(gps, trials)
+    return of_each_person(jax.vmap(lambda both: fit(*both, inference=inference, throw=False)), (gps, trials))
+
+
+def _in_batches(function: Callable[[_People], _Result], people: _People, words: str, say: SayCount) -> _Result:
+    """A function of stacked people for at most `MANY` at once, to bound the memory for intermediate values: one
+    compiled program, whose last batch is filled up with copies of the last person."""
+    count = jax.tree.leaves(people)[0].shape[0]
+    if count <= MANY:
+        return function(people)
+    parts = []
+    for first in range(0, count, MANY):
+        rows = np.minimum(np.arange(first, first + MANY), count - 1)
+        part = function(jax.tree.map(lambda leaf, rows=rows: leaf[rows], people))
+        parts.append(jax.tree.map(lambda leaf, most=count - first: leaf[:most], part))
+        say(words, min(first + MANY, count), count)
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
 def other_inference(study: Study) -> Inference:
@@ -144,14 +207,22 @@ def other_inference(study: Study) -> Inference:
 
 
 def aggregate_cohort(
-    study: Study, cohort: Cohort, seed: int = 0, alternatives: bool = True, first: First = lambda optimum, map_: None
+    study: Study,
+    cohort: Cohort,
+    seed: int = 0,
+    alternatives: bool = True,
+    first: First = lambda optimum, map_: None,
+    *,
+    individuals: bool = True,
+    say: SayCount = _silent,
 ) -> Aggregate:
     """Fit everybody, aggregate, and find the optima; the study's `rule` decides the population optimum.
 
     `seed` decides the candidates that the optima are searched from. Failed certificates are left to the caller, who
     finds them in `posteriors.certificate`. A rule that learns the hyperparameters does so first, if they are not
-    there. `first` is told the optimum and its map as soon as they are known. Raises `InputError` for a table in place
-    of a cohort.
+    there. `first` is told the optimum and its map as soon as they are known. Without `individuals` nobody's own optimum
+    is sought, and without `alternatives` none by another rule. `say` is told the progress above `MANY` participants.
+    Raises `InputError` for a table in place of a cohort.
     """
     if not isinstance(cohort, Cohort):
         raise InputError(
@@ -160,14 +231,14 @@ def aggregate_cohort(
         )
     study = resolved(study, cohort)
     candidates = search_points(study.space, seed)
-    posteriors = fit_cohort(study, cohort)
+    posteriors = _fitted(study, cohort, None, None, say)
     share = share_of(study.gp, cohort.trials, study.inference) if RULES[study.rule].learns_share else None
     map_ = _rule_map(study, cohort, study.rule, posteriors, share)
     optimum = map_optimum(study, map_, candidates)
     first(optimum, map_)
     beside = alternatives and not RULES[study.rule].learns
-    with ThreadPoolExecutor(1) as other_core:  # for what does not wait for the share
-        individuals = other_core.submit(individual_optima, study, posteriors, candidates)
+    with _InOrder() if devices() > 1 else ThreadPoolExecutor(1) as other_core:  # for what does not wait for the share
+        own = other_core.submit(_own_optima, study, posteriors, candidates, say) if individuals else None
         by_other = other_core.submit(_by_other_inference, study, cohort, candidates, share) if beside else None
         if share is None and beside and np.sum(cohort.counts() > 0) > 1:
             share = share_of(study.gp, cohort.trials, study.inference)
@@ -176,12 +247,13 @@ def aggregate_cohort(
         others = {rule: map_optimum(study, other_map, candidates) for rule, other_map in maps.items()}
     if by_other is not None:
         other = other_inference(study)
-        maps[other], others[other] = by_other.result()
+        other_map, others[other] = by_other.result()
+        maps |= {} if other_map is None else {other: other_map}
     return Aggregate(
         cohort=cohort,
         posteriors=posteriors,
         optimum=optimum,
-        individuals=individuals.result(),
+        own=None if own is None else own.result(),
         alternatives=others,
         map=map_,
         maps={study.rule: map_} | maps,
@@ -189,13 +261,34 @@ def aggregate_cohort(
     )
 
 
+class _InOrder(contextlib.nullcontext):
+    """In place of a thread where several devices compute together: each process must run the same programs in the same
+    order."""
+
+    def submit(self, function: Callable[..., _Result], *args: object) -> Future[_Result]:
+        """The function's result, computed now."""
+        result: Future[_Result] = Future()
+        result.set_result(function(*args))
+        return result
+
+    def __enter__(self) -> "_InOrder":
+        return self
+
+
+def _own_optima(study: Study, posteriors: Posterior, candidates: Float[Array, "m d"], say: SayCount) -> Optimum:
+    words = "participants' own optima found (--no-individuals leaves them out)"
+    return _in_batches(lambda people: individual_optima(study, people, candidates), posteriors, words, say)
+
+
 def _by_other_inference(
     study: Study, cohort: Cohort, candidates: Float[Array, "m d"], share: Share | None
-) -> tuple[RuleMap, Optimum]:
-    """The map by the study's rule and its optimum, where everybody is fitted by the other inference."""
+) -> tuple[RuleMap | None, Optimum]:
+    """The map by the study's rule and its optimum, where everybody is fitted by the other inference; above `MANY`
+    participants the optimum alone, since the map holds another posterior of each."""
     other = other_inference(study)
     map_ = _rule_map(study, cohort, study.rule, fit_cohort(study, cohort, inference=other), share, other)
-    return map_, map_optimum(study, map_, candidates)
+    optimum = map_optimum(study, map_, candidates)
+    return (map_ if len(cohort.names) <= MANY else None), optimum
 
 
 def _rules(study: Study, cohort: Cohort, share: Share | None) -> list[str]:
@@ -225,9 +318,12 @@ def _rule_map(
     )
 
 
-def asked_variance(map_: RuleMap, cohort: Cohort) -> Float[Array, ""]:
-    """Largest variance of a map at a point that somebody answered. A scalar."""
+def asked_variance(map_: RuleMap, cohort: Cohort) -> Float[Array, ""] | None:
+    """Largest variance of a map at a point that somebody answered, a scalar; None of more than `MANY` participants by a
+    rule that does not ask for it, since it takes everybody's prediction at everybody's points."""
     if map_.reach is not None:
         return map_.reach
+    if len(cohort.names) > MANY:
+        return None
     points = np.unique(np.asarray(cohort.trials.x)[np.asarray(cohort.trials.mask)], axis=0)
     return to_device(np.asarray(predict_map(map_, to_device(points))[1]).max())

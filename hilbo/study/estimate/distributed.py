@@ -1,9 +1,9 @@
 """Several devices and several processes: who takes part, how work is dealt out, and how a failure ends all of them.
 
-A `Crew` is the devices of all processes in one line. Work is dealt in rounds, one block for each device; every process
-feeds its own devices, and what they return is copied to all processes (JAX's sharding over the whole line), so that
-each of them can go on with the same numbers. Processes find each other by `jax.distributed`: under Slurm and Open MPI
-by themselves, elsewhere by the address of process 0. On CPUs they talk by gloo.
+People are sharded over the devices of all processes (`hilbo.numerics.sharding`). Each process reads all data and runs
+the same programs in the same order, whose results are copied to all of them, so that each goes on with the same
+numbers. Processes find each other by `jax.distributed`: under Slurm and Open MPI by themselves, elsewhere by the
+address of process 0. On CPUs they talk by gloo.
 
 Nobody waits for ever: bad input is exchanged before work begins, so that all stop with a sentence; a process that dies
 later breaks the next exchange, or is missed by JAX's heartbeats, and the others end with an error.
@@ -14,19 +14,18 @@ import hashlib
 import os
 import sys
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree, UInt8
 
 from hilbo.errors import InputError
+from hilbo.numerics.sharding import people_mesh
 
-__all__ = ["AXIS", "Crew", "alone", "crew", "digest"]
+__all__ = ["Crew", "crew", "digest"]
 
-AXIS = "people"
 _MEETING, _HEARTBEAT = 120, 60  # s to find each other, and after which a silent process counts as dead
 _WRITING = 3600  # s that the others wait at the end for the one that writes; a dead one is missed by then
 
@@ -36,9 +35,8 @@ class AgreedError(InputError):
 
 
 class Crew(NamedTuple):
-    """The devices of all processes, and which process this is."""
+    """Which process this is, and of how many."""
 
-    mesh: Mesh
     rank: int
     count: int
 
@@ -47,29 +45,10 @@ class Crew(NamedTuple):
         """Whether this process writes the results and reports progress: the first one does."""
         return self.rank == 0
 
-    @property
-    def devices(self) -> int:
-        """Devices of all processes."""
-        return self.mesh.devices.size
-
-    @property
-    def platform(self) -> str:
-        """ "cpu", "gpu", ...; the devices are all of a kind."""
-        return self.mesh.devices.flat[0].platform
-
-    @property
-    def everywhere(self) -> NamedSharding:
-        """Of arrays that each device holds a copy of."""
-        return NamedSharding(self.mesh, PartitionSpec())
-
-    def deal(self, blocks: PyTree) -> PyTree:
-        """Arrays on the host with a leading axis of `devices`, as arrays of which each device holds one row."""
-        dealt = NamedSharding(self.mesh, PartitionSpec(AXIS))
-
-        def place(rows):
-            return jax.make_array_from_callback(rows.shape, dealt, lambda index: rows[index])
-
-        return jax.tree.map(place, blocks)
+    @staticmethod
+    def sharded() -> contextlib.AbstractContextManager[Any]:
+        """A context in which people are sharded over the devices of all processes; a no-op for one device."""
+        return jax.set_mesh(people_mesh()) if jax.device_count() > 1 else contextlib.nullcontext()
 
     @contextlib.contextmanager
     def agreement(self) -> Iterator[Callable[[str], None]]:
@@ -101,11 +80,6 @@ class Crew(NamedTuple):
         return np.asarray(multihost_utils.process_allgather(mark)).reshape(self.count, 8)
 
 
-def alone() -> Crew:
-    """This process with all its devices."""
-    return Crew(Mesh(np.array(jax.devices()), (AXIS,)), 0, 1)
-
-
 @contextlib.contextmanager
 def crew(
     distributed: bool, coordinator: str | None = None, processes: int | None = None, process: int | None = None
@@ -117,12 +91,12 @@ def crew(
     if not distributed:
         if (coordinator, processes, process) != (None, None, None):
             raise InputError("--coordinator, --processes and --process-id need --distributed.")
-        yield alone()
+        yield Crew(0, 1)
         return
     _meet(coordinator, processes, process)
     rank, count = jax.process_index(), jax.process_count()
     try:
-        yield Crew(Mesh(np.array(jax.devices()), (AXIS,)), rank, count)
+        yield Crew(rank, count)
     except AgreedError as error:
         _leave(str(error), rank, count, 2)
     except BaseException as error:

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from hilbo import acquisition, bcm
+from hilbo import acquisition
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.climbing import Choice
+from hilbo.numerics.sharding import of_each_person
 from hilbo.numerics.shown import shown
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior
@@ -63,25 +64,19 @@ def predict_people(
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Mean and variance (m,) of the population map at points of the unit cube, aggregated point by point.
 
-    Of bcm, participants' predictions are made in blocks and never held all at once. `share`: of the hierarchical rule.
+    Participants' predictions are never held all at once. `share`: of the hierarchical rule.
     """
     prior = jax.vmap(jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel.diagonal)(x)
-    if not RULES[rule].product:
-        means, explained = jax.vmap(lambda p: p.predict_explained(x))(posteriors)
-        return pointwise.aggregate(rule, means, explained, prior, share=share)
-    evidence = bcm.stream(lambda p: p.predict_explained(x), posteriors, prior)
-    return evidence.merge(prior)
+    return pointwise.merged(rule, posteriors, x, prior, share)
 
 
 def predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Mean and variance (m,) of a population map at points of the unit cube; bcm's as a stream over people."""
+    """Mean and variance (m,) of a population map at points of the unit cube."""
     return _predict_map(_nameless(map_), x)
 
 
 @program
 def _predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    if map_.experts is not None and RULES[map_.rule].product:
-        return predict_people(map_.experts, x)
     return map_.predict(x)
 
 
@@ -230,14 +225,18 @@ def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Arr
 
 @program
 def _individual_optima(space: SearchSpace, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
-    def one(posterior):
+    def one(posterior, space, candidates):
         x = best_point(space, posterior, candidates).x
         mean, variance = posterior.predict(x[None, :])
         probabilities = posterior.gp.likelihood.class_probabilities(mean[0], variance[0])
         return Optimum(x, mean[0], jnp.sqrt(variance[0]), probabilities)
 
-    # On a CPU one after the other: each search stops when it is done, where a batch waits for its slowest.
-    return jax.lax.map(one, posteriors, batch_size=None if jax.default_backend() == "cpu" else 256)
+    def each(people, space, candidates):
+        # On a CPU one after the other: each search stops when it is done, where a batch waits for its slowest.
+        batch = None if jax.default_backend() == "cpu" else 256
+        return jax.lax.map(lambda posterior: one(posterior, space, candidates), people, batch_size=batch)
+
+    return of_each_person(each, posteriors, space, candidates)
 
 
 def best_point(space: SearchSpace, posterior: Posterior, candidates: Float[Array, "m d"]) -> Choice:
