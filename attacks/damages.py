@@ -40,9 +40,10 @@ from hilbo.session.choose.warm_start import read_warm_start
 from hilbo.session.export import tables as log_tables
 from hilbo.session.log.event_log import EventLog, read_session
 from hilbo.session.plan.participants import add_person, read_people
-from hilbo.session.plan.plan import make_plan, plan_hash, planned_header, read_plan
+from hilbo.session.plan.plan import make_plan, planned_header
 from hilbo.session.plan.validation_sets import aggregate_best_sets
 from hilbo.study.cohort import read_trials
+from hilbo.study.file.plan_file import hashed, plan_in, plan_text, read_plan
 from hilbo.study.formats.json_file import sealed
 from hilbo.study.results.map_netcdf import write_map
 from hilbo.study.results.result_json import read_result
@@ -312,14 +313,13 @@ def _forged_map(rng: random.Random, content: bytes) -> bytes:
 def _plan(path: Path) -> Path:
     sets = {"aggregate": {"u": 0.5, "v": 0.25}} | {f"individual:{p}": {"u": 0.1, "v": 0.2} for p in PEOPLE}
     plan = make_plan(PLAIN.file, ["J01", "J02"], 3, "aggregate-best", sets={"": sets})
-    path.write_text(json.dumps(plan, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    path.write_text(plan_text(plan), encoding="utf-8")
     return path
 
 
 def _read_plan(path: Path) -> Any:
     plan = read_plan(path)
-    names = [row.get("participant") for row in plan.get("participants", []) if isinstance(row, dict)]
-    headers = [planned_header(plan, PLAIN.file, name) for name in names or ["J01"]]
+    headers = [planned_header(plan, PLAIN.file, row.participant) for row in plan.participants]
     for header in headers:
         _in_range(header.sets, PLAIN)
         for block in header.blocks:
@@ -328,10 +328,9 @@ def _read_plan(path: Path) -> Any:
 
 
 def _forged_plan(rng: random.Random, content: bytes) -> bytes:
-    plan = mutated(rng, json.loads(content))
-    if isinstance(plan, dict):
-        plan["hash"] = plan_hash(plan)
-    return json.dumps(plan, indent=1).encode()
+    forged = json.dumps(mutated(rng, json.loads(content)), indent=1).encode()
+    plan = plan_in(forged)
+    return forged if plan is None else plan_text(hashed(plan)).encode()
 
 
 def _tables(folder: Path) -> tuple[Path, Path, Path]:
