@@ -163,5 +163,5 @@ def test_an_export_names_the_log_whose_label_a_spreadsheet_would_run(tmp_path):
     lines = write(path, "optimisation")
     lines[0]["data"]["session"] = "=1+1"
     chained(path, lines)
-    with pytest.raises(InputError, match=r"P01_-1-1\.session\.jsonl: the session's label"):
+    with pytest.raises(InputError, match=r"P01_-1-1~[0-9a-f]{8}\.session\.jsonl: the session's label"):
         psych_ds(read_sessions(tmp_path, STUDY.file), tmp_path / "tables", STUDY.file)
