@@ -1,15 +1,15 @@
 """The attempts of attacks/access.py, and the table of their outcomes in the documentation."""
 
-from pathlib import Path
+import subprocess
+import sys
 
 import pytest
-from simulated import needs_device, own_cache  # noqa: F401
+from simulated import ENVIRONMENT, ROOT, needs_device, own_cache  # noqa: F401
 
-from attacks.access import ATTEMPTS, table, tried
-from attacks.access_ground import ground
+from attacks.access import ATTEMPTS, table
 from hilbo.app.rehearsal.robot import find_browser
 
-LIVE = Path(__file__).parents[2] / "docs" / "guides" / "live.md"
+LIVE = ROOT / "docs" / "guides" / "live.md"
 
 
 def test_the_documentation_has_the_outcomes_that_are_tried():
@@ -21,5 +21,8 @@ def test_the_documentation_has_the_outcomes_that_are_tried():
 @needs_device
 @pytest.mark.skipif(find_browser() is None, reason="needs playwright and Chromium (Debian: chromium)")
 def test_every_attempt_has_its_outcome():
-    with ground() as attacked:
-        assert [words for attempt in ATTEMPTS if (words := tried(attacked, attempt)).startswith("THROUGH")] == []
+    """In a process of its own: attempts of another user fork, which JAX's threads in this one forbid."""
+    command = [sys.executable, str(ROOT / "attacks" / "access.py")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500, env=ENVIRONMENT)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert f"{len(ATTEMPTS)}  in all" in done.stdout

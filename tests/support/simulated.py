@@ -10,7 +10,7 @@ import pytest
 
 from hilbo.device.ports import POLL, open_port
 
-__all__ = ["ENVIRONMENT", "FaultyPort", "needs_device", "own_cache"]
+__all__ = ["ENVIRONMENT", "ROOT", "FaultyPort", "needs_device", "own_cache"]
 
 ROOT = Path(__file__).parents[2]
 CACHE = ROOT / ".pytest_cache" / "device"
