@@ -12,8 +12,10 @@ import msgspec
 import pytest
 
 from hilbo.study.file import schema
+from hilbo.study.file.columns import UNWRITTEN
 from hilbo.study.file.protocols import PhaseTable
 from hilbo.study.file.reading import checked
+from hilbo.study.file.trial_flags import FLAGS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -191,6 +193,7 @@ def test_the_first_study_begins_as_its_page_says(tmp_path):
 def test_the_data_dictionary_is_that_of_the_code():
     page = script("columns").page()
     assert (DOCS / "guides" / "columns.md").read_text(encoding="utf-8") == page, "run python docs/site/columns.py"
+    assert ", ".join(FLAGS) in page and f"'{UNWRITTEN}'" in page
 
 
 def test_the_page_of_mistakes_says_what_hilbo_says():  # fits once, for what is said in Python: 2 s

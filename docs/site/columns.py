@@ -1,8 +1,8 @@
-"""The data dictionary as a page: `python docs/site/columns.py` writes it anew."""
+"""hilbo/data/columns.csv as a page: `python docs/site/columns.py` writes it anew."""
 
 from pathlib import Path
 
-from hilbo.study.file.columns import EXPORTED, REPORTED, Meaning
+from hilbo.study.file.columns import COLUMNS, EXPORTED, Meaning
 
 PAGE = Path(__file__).parents[1] / "guides" / "columns.md"
 HEAD = """\
@@ -22,10 +22,10 @@ def page() -> str:
     parts = [HEAD]
     for head, tables in (
         ("Tables of `hilbo export`, `data/study-NAME_table-TABLE_data.csv`", EXPORTED),
-        ("Tables of `hilbo report`, `TABLE.csv`", REPORTED),
+        ("Tables of `hilbo report`, `TABLE.csv`", [name for name in COLUMNS if name not in EXPORTED]),
     ):
         parts.append(f"## {head}\n")
-        parts += [f"### {name}\n\n{rows(columns)}" for name, columns in tables.items()]
+        parts += [f"### {name}\n\n{rows(COLUMNS[name])}" for name in tables]
     return "\n".join(parts)
 
 

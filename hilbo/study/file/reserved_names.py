@@ -6,7 +6,7 @@ compares them. Loads no JAX.
 
 from collections.abc import Collection
 
-from hilbo.study.file.columns import EXPORTED, REPORTED
+from hilbo.study.file.columns import COLUMNS
 from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES
 
 __all__ = ["TRIAL_COLUMNS", "is_reserved"]
@@ -22,7 +22,7 @@ _RENDERED = frozenset(("K0", "N", "T", "memory", "states", "force_limit"))
 _OF_CSV = {
     name
     for table in ("trials", "sets", "optima", "alternatives", "comparison")
-    for name in (EXPORTED | REPORTED)[table]
+    for name in COLUMNS[table]
     if name not in _RENDERED
 }
 _OF_FILES = {
