@@ -150,8 +150,9 @@ def _note_the_absent(
 def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
     """A piece with its numbers as numbers and its texts as one object each, and `_fitted`: which rows count."""
     numeric = {"trial", *study.space.names}
+    names: list[str] = list(text.columns)
     table: dict[str, object] = {}  # a frame at once: each column that is added to one costs as many as there are
-    for column in text.columns:
+    for column in names:
         if column in numeric:
             table[column] = np.nan  # its place among the columns
         elif others or column in (*_KEY, study.random_effect, COLUMN, COLUMN_OF_SAMPLES):
