@@ -39,7 +39,7 @@ def test_names_are_told_confirmed_and_written(tmp_path):
         assert texture.values.tolist() == texture.attrs["levels"] == list(LEVELS)
     psych_ds([state], tmp_path / "out", live.study.file)
     words = (tmp_path / "out" / "dataset_description.json").read_text()
-    assert "Parameter, one of silk, wood, smooth stone" in words
+    assert "value of the parameter, one of silk, wood, smooth stone" in words
 
 
 @pytest.mark.deep  # it compiles a step
