@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from jax.typing import ArrayLike
 from jaxtyping import Float
 from scipy.interpolate import RegularGridInterpolator
 
@@ -59,7 +60,7 @@ def _from(grid: xr.Dataset) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     values = np.stack([grid["mean"].values, grid["variance"].values], axis=-1)
     between = RegularGridInterpolator(sides, values, method="cubic")
 
-    def surface(x: Float[np.ndarray, "m d"]) -> tuple[np.ndarray, np.ndarray]:
+    def surface(x: Float[ArrayLike, "m d"]) -> tuple[np.ndarray, np.ndarray]:
         values = between(np.asarray(x))
         return values[:, 0], values[:, 1]
 
