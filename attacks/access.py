@@ -209,7 +209,7 @@ def _listed(ground: Ground) -> str:
 
 
 def _waits(ground: Ground) -> str:
-    """Somebody listens on the session's port once the server is gone, while a page of it is open."""
+    """Another user's program listens on the session's port after the server has ended, while a page is still open."""
     ground.process.kill()
     ground.process.wait(_PATIENCE)
     port, end = int(ground.address.rpartition(":")[2]), time.monotonic() + _PATIENCE

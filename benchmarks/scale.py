@@ -107,7 +107,7 @@ def result(folder, out):
 
 
 def together(folder, people, rule, count):
-    """So many processes on this machine that make one result."""
+    """Run `count` processes on this machine, which compute one result together."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
@@ -125,7 +125,7 @@ def together(folder, people, rule, count):
 
 
 def started(folder, people, rule, out, *more, flags=""):
-    """One `hilbo aggregate`, without everybody's own optimum."""
+    """Start one `hilbo aggregate --no-individuals`; returns its process."""
     trials = folder / f"{people}.csv"
     if not trials.exists():
         write_trials(answers(Study.load(STUDY), people), trials)
