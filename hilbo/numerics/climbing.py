@@ -53,17 +53,22 @@ def climb(
 ) -> Choice:
     """Maximise `score` from several starts by Newton's method; return the best point found.
 
+    The result is never below the best usable start, which is returned itself for `steps` = 0. Without a usable start
+    its value is -inf.
+
     **Arguments:**
 
-    - `starts` (s, d) points of the unit cube, `usable` (s,); the result's `candidate` is a row of these.
-    - `score`: of one point, differentiable.
-    - `from_box`, `to_box`: between the optimiser's cube, in which everything is feasible, and the unit cube.
-    - `feasible`: whether a point may be rendered (starts are known to be feasible).
-    - `allowed`: which points may be chosen, e.g. none too close to earlier ones.
-    - `walls`: linear constraints in the optimiser's cube, if not everything in it is feasible; `held`: discrete
-      coordinates, and `neighbours`: the points one step away, which are tried at the end of each search.
-    - `steps`: largest number of Newton steps from each start.
-    - `gain`: a search ends where the score could rise by less than this within the cube (`TrustRegionNewton`).
+    - `starts` (s, d): feasible points of the unit cube; `usable` (s,): mask of those to search from. The result's
+      `candidate` is a row of these.
+    - `score`: differentiable function of one point (d,) of the unit cube.
+    - `from_box`, `to_box`: maps between the optimiser's coordinates, in [0, 1]^d, and the unit cube.
+    - `feasible`: whether a point is feasible.
+    - `allowed`: further condition on the end of a search, e.g. not too close to earlier points.
+    - `walls`: linear constraints in the optimiser's coordinates; None if all of [0, 1]^d is feasible there. Only with
+      `walls` are these two used: `held`: mask of the discrete coordinates; `neighbours`: the points one discrete step
+      away, tried at the end of each search.
+    - `steps`: largest number of Newton steps of a search.
+    - `gain`: a search ends where the score could rise by less than this (see `TrustRegionNewton`).
     """
 
     def may_end(x):
@@ -93,16 +98,21 @@ class _Straight(NamedTuple):
     gain: ArrayLike
 
     def best(self, starts: Float[Array, "s d"], usable: Bool[Array, " s"]) -> Choice:
-        """Best end of the searches from all usable starts."""
+        """Search from all usable starts, one after the other, and return the best end.
+
+        `starts` (s, d), `usable` (s,). The value is -inf if no start is usable.
+        """
         no_ends = jnp.full((), -jnp.inf, starts.dtype), jnp.full_like(starts, jnp.nan)
         _, (ends, values, start_values) = jax.lax.scan(self._next, no_ends, (starts, usable, jnp.arange(len(starts))))
         return _best_of(ends, values, start_values)
 
     def _next(self, state, start):
-        """Search from one start.
+        """Search from one start; a step of `jax.lax.scan`.
 
-        `state`: highest score so far, and the ends of the searches; `start`: a point, whether it is usable, and its
-        row. Returns the next state, and the end, its score, and the score of the start.
+        `state`: highest score so far, and the ends (s, d) of the unit-cube searches, feasible or not, NaN for those to
+        come. `start`: a point, whether it is usable, and its row. Returns the next state, and (end, score there, score
+        of the start). The end is the start itself if the search found nothing higher that is feasible; the scores of an
+        unusable start are -inf.
         """
         (highest, earlier_ends), (x, may, row) = state, start
         start_value = jnp.where(may, self.score(x), -jnp.inf)
@@ -119,7 +129,11 @@ class _Straight(NamedTuple):
         return (jnp.maximum(highest, value), earlier_ends.at[row].set(straight)), (end, value, start_value)
 
     def _along_the_wall(self, x, outside):
-        """Search in the optimiser's coordinates, after a search from x ended `outside` the feasible set."""
+        """Search in the optimiser's coordinates, after a search from `x` ended `outside` the feasible set.
+
+        Starts at the projection of `outside` or at `x`, whichever scores higher. Returns the end in the unit cube and
+        its score, -inf if the end is not feasible or not allowed.
+        """
         aside = self.from_box(jnp.clip(self.to_box(outside), 0.0, 1.0))
         start = jnp.where(self.score(aside) > self.score(x), aside, x)
         w, value = _polish(lambda w: self.score(self.from_box(w)), self.to_box(start), self.steps, self.gain, {})
@@ -128,7 +142,7 @@ class _Straight(NamedTuple):
 
 
 class _Within(NamedTuple):
-    """Search with walls or discrete coordinates, in the optimiser's coordinates."""
+    """Search with walls or discrete coordinates, in the optimiser's coordinates. Fields as the arguments of `climb`."""
 
     score: _Score
     from_box: _Map
@@ -141,7 +155,11 @@ class _Within(NamedTuple):
     def climbed(
         self, start: _Point, usable: Bool[Array, ""], steps: int, gain: ArrayLike
     ) -> tuple[_Point, Float[Array, ""], Float[Array, ""]]:
-        """Search from a start; return the end, its score, and the score of the start."""
+        """Search from one start: Newton's method, then the best neighbour, repeated while a neighbour is higher.
+
+        Returns the end in the unit cube, its score, and the score of the start; for an unusable start the start and
+        -inf.
+        """
         start_value = jnp.where(usable, self.score(start), -jnp.inf)
         if steps == 0:
             return start, start_value, start_value
@@ -163,7 +181,10 @@ class _Within(NamedTuple):
         return end, value, start_value
 
     def _polished(self, x, value, steps, gain):
-        """End of Newton's method from x; x itself if that is not higher or not allowed."""
+        """Run Newton's method from `x`, whose score is `value`, with the discrete coordinates fixed.
+
+        Returns the end and its score, or `x` and `value` if the end is not higher or not allowed.
+        """
         options = {"walls": self.walls, "held": self.held}
         w, height = _polish(lambda w: self.score(self.from_box(w)), self.to_box(x), steps, gain, options)
         end = jnp.where(self.held, x, self.from_box(jnp.clip(w, 0.0, 1.0)))  # a step may end a rounding error outside
@@ -171,7 +192,7 @@ class _Within(NamedTuple):
         return jnp.where(better, end, x), jnp.where(better, height, value)
 
     def _around(self, x):
-        """Points one step away, projected between the walls, and their scores; -inf if not allowed."""
+        """Neighbours (k, d) of `x`, projected between the walls, and their scores (k,), -inf if not allowed."""
         assert self.neighbours is not None
         near = self.neighbours(x)
         if self.walls.normals.shape[0]:
@@ -180,7 +201,7 @@ class _Within(NamedTuple):
         return near, jnp.where(may, jax.vmap(self.score)(near), -jnp.inf)
 
     def _between(self, x):
-        """Nearest point between the walls with the same discrete coordinates."""
+        """Move `x` to the nearest point between the walls with the same discrete coordinates; unit cube in and out."""
         w = self.to_box(x)
         cube = walls_of_cube(self.walls, self.held, w)
         left = self.walls.offsets.astype(w.dtype) - self.walls.normals.astype(w.dtype) @ w
@@ -190,7 +211,7 @@ class _Within(NamedTuple):
 
 
 def _best_of(ends: Float[Array, "s d"], values: Float[Array, " s"], start_values: Float[Array, " s"]) -> Choice:
-    """Best of the ends, with the best start."""
+    """`Choice` of the end with the highest of `values` and of the start with the highest of `start_values`."""
     best, best_start = jnp.argmax(values), jnp.argmax(start_values)
     return Choice(ends[best], values[best], best_start, start_values[best_start])
 
@@ -198,9 +219,10 @@ def _best_of(ends: Float[Array, "s d"], values: Float[Array, " s"], start_values
 def spread(
     values: Float[Array, " m"], candidates: Float[Array, "m d"], count: int, apart: float = 0.1
 ) -> Int[Array, " count"]:
-    """Rows of high values at distinct locations: the maximum, the maximum further than `apart` from it, and so on.
+    """Rows of high values at distinct locations: the maximum, the maximum at least `apart` from it, and so on.
 
-    `values` (m,), `candidates` (m, d) -> (count,) row numbers.
+    `values` (m,), `candidates` (m, d) -> (count,) row numbers; `apart`: Euclidean distance to all rows chosen before.
+    If no candidate is left, or no finite value, row 0 fills the rest.
     """
 
     def pick(remaining, _):
@@ -218,7 +240,10 @@ def _polish(
     gain: Any,
     options: dict[str, Any],
 ) -> tuple[_Point, Float[Array, ""]]:
-    """Newton's method within the unit cube, or between the walls of `options`; returns the end and its score."""
+    """Maximise `score` from `start` by Newton's method within [0, 1]^d; return the end and its score.
+
+    `options`: further options of `TrustRegionNewton`, such as "walls". Reaching `steps` is no error.
+    """
     import optimistix as optx  # slow to import, and needed only where a search is traced
 
     from hilbo.numerics.newton import TrustRegionNewton

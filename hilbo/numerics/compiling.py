@@ -14,17 +14,20 @@ _TRIED = (0, 10)  # the last version known to have the flag; XLA ends the proces
 
 
 def compiler_options() -> dict[str, bool]:
-    """Compiler options for one function: `jax.jit(f, compiler_options=compiler_options())`."""
+    """Compiler options for one function, for `jax.jit(f, compiler_options=...)`; {} for an untested jaxlib."""
     return {_FLAG: False} if _flag_exists() else {}
 
 
 def set_flags() -> None:
-    """Set the XLA flag for the whole process, before its first computation; a value in the environment is kept."""
+    """Add the flag to the environment variable XLA_FLAGS, which XLA reads before its first computation.
+
+    A flag of this name that is already there stays; an untested jaxlib gets none.
+    """
     flags = os.environ.get("XLA_FLAGS", "")
     if _flag_exists() and _FLAG not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --{_FLAG}=false".strip()
 
 
 def _flag_exists() -> bool:
-    """Whether this jaxlib version is known to support the flag."""
+    """Whether jaxlib's version is at most the last one tested with the flag."""
     return tuple(map(int, version("jaxlib").split(".")[:2])) <= _TRIED

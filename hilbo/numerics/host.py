@@ -26,12 +26,15 @@ def namespace_of(*values: Any) -> Any:
 
 
 def on_host(*values: Any) -> bool:
-    """Whether all values are NumPy arrays or scalars."""
+    """Whether all values are NumPy arrays or NumPy scalars; False for plain Python numbers."""
     return all(isinstance(value, np.ndarray | np.generic) for value in values)
 
 
 def scan(step: Callable[[Any, Any], Any], start: Any, over: Any) -> Any:
-    """Fold `step(carry, value)` over the first axis of an array: a loop for NumPy arrays, else `jax.lax.scan`."""
+    """Final carry of `step(carry, value) -> carry` over the first axis of `over`, beginning with `start`.
+
+    A Python loop if `over` is a NumPy array, else `jax.lax.scan`.
+    """
     if on_host(over):
         return functools.reduce(step, over, start)
     import jax
@@ -40,9 +43,10 @@ def scan(step: Callable[[Any, Any], Any], start: Any, over: Any) -> Any:
 
 
 def to_device(value: Any, dtype: Any = None) -> Any:
-    """Convert a value to a JAX array, without compiling anything if it is NumPy's or Python's.
+    """Convert a value to a JAX array, of its own dtype or `dtype`.
 
-    The copy is independent of the original.
+    Values of NumPy or Python are copied, and nothing is compiled; a value that contains JAX arrays goes to
+    `jnp.asarray`. Raises `TypeError` or `ValueError` for what is no numeric array.
     """
     import jax
 
@@ -52,6 +56,9 @@ def to_device(value: Any, dtype: Any = None) -> Any:
 
 
 def floating(x: Any) -> Any:
-    """Convert values to floating-point numbers of the default type; NumPy arrays stay NumPy arrays."""
+    """Convert values to an array of floating-point numbers: NumPy for NumPy arrays and plain numbers, else JAX.
+
+    Floating-point arrays keep their precision; others get the default one.
+    """
     xp = namespace_of(x)
     return xp.asarray(x, xp.result_type(1.0, x))

@@ -71,7 +71,8 @@ def least_squares(
     """Minimise |`residuals`(q)|² over the box from `start`; parameters with lower = upper stay there.
 
     Ends when a step promises to lower the cost by less than `enough` of it (eps^0.75, 2e-12 in float64, by default), or
-    when rounding lets no step improve. A start with residuals that are not finite ends unconverged.
+    when rounding lets no step improve. Not converged after `max_steps`, or if residuals at the start are not finite;
+    nothing is raised.
     """
     start = jnp.clip(start, lower, upper)
     eps = jnp.finfo(start.dtype).eps
@@ -95,7 +96,11 @@ def least_squares(
 
 
 def _judged(state: _State, q: Float[Array, " p"], trial: _Evaluation, tiny: ArrayLike, least: ArrayLike) -> _State:
-    """Next state: the step to q accepted or rejected; `trial`: evaluation at q."""
+    """State after the step to `q`: moved there if the cost fell, else unchanged but for a larger damping.
+
+    `trial`: evaluation at `q`; `tiny`: relative step that counts as no step; `least`: fraction of the cost that a step
+    must promise, below which the search is done.
+    """
     cost, gradient, normal = trial
     moved = q - state.q
     better = cost < state.cost
@@ -113,7 +118,7 @@ def _judged(state: _State, q: Float[Array, " p"], trial: _Evaluation, tiny: Arra
 
 
 def _direction(state: _State, lower: Float[Array, " p"], upper: Float[Array, " p"]) -> Float[Array, " p"]:
-    """Damped step of the free parameters; 0 for the others."""
+    """Damped step (p,) of the free parameters; 0 for parameters that are fixed, held at a bound, or without effect."""
     held = ((state.q <= lower) & (state.gradient >= 0)) | ((state.q >= upper) & (state.gradient <= 0))
     free = ~held & (lower < upper)
     size = jnp.diag(state.normal)
@@ -126,6 +131,6 @@ def _direction(state: _State, lower: Float[Array, " p"], upper: Float[Array, " p
 
 
 def solve_symmetric(matrix: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:
-    """Solve a positive definite system; may be mapped by `vmap` (see `linalg`)."""
+    """Solve matrix · x = right for a symmetric positive definite matrix; may be mapped by `vmap` (see `linalg`)."""
     factor = linalg.cholesky(matrix)
     return linalg.solve_lower_transposed(factor, linalg.solve_lower(factor, right[:, None]))[:, 0]

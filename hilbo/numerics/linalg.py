@@ -16,9 +16,10 @@ __all__ = ["cholesky", "eigh", "one_at_a_time", "solve_lower", "solve_lower_tran
 
 
 def one_at_a_time(function: Callable, together: Callable | None = None) -> Callable:
-    """Decorator for `vmap`: a loop over `function` on CPUs.
+    """Decorator that sets what `vmap` does: on a CPU it loops over `function`; elsewhere it maps `together`.
 
-    Elsewhere the batched `function`, or the equivalent `together`.
+    `together` (default: `function` itself) is an equivalent that is batched well. Without `vmap` the function is
+    unchanged.
     """
     mapped = jax.custom_batching.custom_vmap(function)
     batched = jax.vmap(function if together is None else together)
@@ -38,14 +39,14 @@ def one_at_a_time(function: Callable, together: Callable | None = None) -> Calla
 
 @one_at_a_time
 def eigh(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Eigenvalues, increasing, and eigenvectors (columns) of a symmetric matrix, of which the lower half is read."""
+    """Eigenvalues (n,), increasing, and eigenvectors (columns) of a symmetric matrix; its lower triangle is read."""
     vectors, eigenvalues = jax.lax.linalg.eigh(matrix, symmetrize_input=False)
     return eigenvalues, vectors
 
 
 @one_at_a_time
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Lower Cholesky factor of a positive definite matrix, of which the lower half is read."""
+    """Lower Cholesky factor of a positive definite matrix, of which the lower triangle is read; NaN if it is not."""
     return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 

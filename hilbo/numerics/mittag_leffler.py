@@ -66,13 +66,13 @@ def _increment(alpha: Float[Array, ""], z: Float[Array, ""]) -> Float[Array, ""]
 
 
 def _safe(a: Float[Array, ""], b: Float[Array, ""], z: Float[Array, ""], nodes: _Nodes) -> Float[Array, ""]:
-    """E_{a,b}(-z), with the value at z = 0 treated separately."""
+    """E_{a,b}(-z), also at z = 0; differentiable. `nodes`: nodes x and weights of the quadrature."""
     at_zero = jnp.where(b == 1, 1, 1 / gamma(b))
     return jnp.where(z > 0, _integral(a, b, jnp.where(z > 0, z, 1), nodes), at_zero)
 
 
 def _integral(a: Float[Array, ""], b: Float[Array, ""], z: Float[Array, ""], nodes: _Nodes) -> Float[Array, ""]:
-    """The integral of the module docstring, for z > 0."""
+    """E_{a,b}(-z) for z > 0, by the integral of the module docstring; `nodes`: its nodes x and their weights."""
     x, step = (jnp.asarray(value, z.dtype) for value in nodes)
     # The integral does not depend on φ, so its derivative need not know how φ was chosen.
     phi = jax.lax.stop_gradient(jnp.pi / 4 - jnp.minimum(jnp.pi / 2 * (1 - a) / a, jnp.pi / 4))
@@ -90,7 +90,7 @@ def _integral(a: Float[Array, ""], b: Float[Array, ""], z: Float[Array, ""], nod
 def _log_one_plus(
     log_u: Float[Array, " nodes"], psi: Float[Array, ""]
 ) -> tuple[Float[Array, " nodes"], Float[Array, " nodes"]]:
-    """log(1 + u·e^{iψ}) as real part and angle, for 0 < ψ < π and u of any size."""
+    """Real and imaginary part of log(1 + u·e^{iψ}), for 0 < ψ < π. `log_u` is log u, of any size."""
     big = log_u > 0
     u = jnp.exp(-jnp.abs(log_u))
     angle = jnp.arctan2(u * jnp.sin(psi), 1 + u * jnp.cos(psi))

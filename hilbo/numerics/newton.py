@@ -46,7 +46,7 @@ class Expansion(NamedTuple):
 def expanded(
     function: Callable[[Float[Array, " p"]], tuple[Float[Array, ""], PyTree]], at: Float[Array, " p"]
 ) -> Expansion:
-    """Expand a function of (value, aux) at a point by automatic differentiation."""
+    """Expand a function that returns (value, aux) at a point (p,) by automatic differentiation."""
 
     def slope(point):
         value, pull, aux = jax.vjp(function, point, has_aux=True)
@@ -92,9 +92,9 @@ class TrustRegionNewton(optx.AbstractMinimiser):
     gain: float | Float[Array, ""] = 0.0
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """Initial state: at the start if its expansion is given.
+        """Initial state, with the first step planned if the expansion at the start is given as "begun".
 
-        Else empty, so that the first step evaluates the start.
+        Otherwise the state is empty, its value inf, and the first step evaluates the start.
         """
         del fn, args, f_struct, tags
         flat, _ = ravel_pytree(y)
@@ -108,7 +108,10 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         return _State(nowhere, jnp.zeros_like(flat), zero, zero + _FIRST_RADIUS, infinite[0], infinite[0])
 
     def step(self, fn, y, args, options, state, tags):
-        """Evaluate the planned step, accept or reject it, and plan the next."""
+        """Evaluate the planned step, accept or reject it, and plan the next.
+
+        Returns the best point so far, the next state, and the auxiliary output at that point.
+        """
         del tags
         flat, restore = ravel_pytree(y)
         trial = flat + state.move
@@ -127,7 +130,11 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         return restore(flat), _planned(best, flat, radius, options), best.aux
 
     def terminate(self, fn, y, args, options, state, tags):
-        """Whether the search is stationary within the box, stuck, or approaching a known end."""
+        """Whether to stop, with the result code, which is always "successful".
+
+        Stops where the point is stationary within the box, stuck, on a plateau, or where the next step leads to a known
+        end.
+        """
         del fn, args, tags
         ended = (state.pressing <= self.atol) | (state.ahead < self.gain) | (state.radius < self.resolution)
         earlier_ends = options.get("known")
@@ -136,13 +143,13 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         return ended, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Return the result unchanged."""
+        """Return the point and its auxiliary output unchanged, and empty statistics; required by optimistix."""
         del fn, args, options, state, tags, result
         return y, aux, {}
 
 
 def arrives(y: PyTree, move: Float[Array, " p"], ends: Float[Array, "k p"]) -> Bool[Array, ""]:
-    """Whether the step from `y` leads to one of the known ends."""
+    """Whether the step `move` from `y` leads to one of the known `ends`, to 0.01 in every coordinate; never to NaN."""
     target = ravel_pytree(y)[0] + move
     return jnp.any(jnp.max(jnp.abs(ends - target[None, :]), axis=1) < _SAME)
 
@@ -150,7 +157,10 @@ def arrives(y: PyTree, move: Float[Array, " p"], ends: Float[Array, "k p"]) -> B
 def _planned(
     expansion: Expansion, point: Float[Array, " p"], radius: Float[Array, ""], options: dict[str, Any]
 ) -> _State:
-    """State at `point` with the next step, within the bounds or walls of the options."""
+    """State at `point` with the next step, between the "walls" of `options` or else its bounds "lower" and "upper".
+
+    `expansion`: the function's, at `point`; `radius`: trust radius.
+    """
     if "walls" in options:
         return _plan_between(expansion, point, radius, options["walls"], options["held"])
     none = jnp.full_like(point, jnp.inf)
@@ -161,7 +171,7 @@ def _planned(
 def _plan_between(
     expansion: Expansion, point: Float[Array, " p"], radius: Float[Array, ""], walls: Polytope, held: Bool[Array, " p"]
 ) -> _State:
-    """State at `point` with the next step, between linear walls within the unit cube."""
+    """State at `point` with the next step, between linear walls within the unit cube; `held` variables do not move."""
     seen = walls_of_cube(walls, held, point)
     plain = jnp.eye(point.size, dtype=point.dtype)
     touching = seen.offsets <= _TOUCHES
@@ -191,7 +201,7 @@ def _plan(
     lower: Float[Array, " p"],
     upper: Float[Array, " p"],
 ) -> _State:
-    """State at `point` with the next step, within a box."""
+    """State at `point` with the next step, within the box [lower, upper]."""
     held = (point <= lower) & (expansion.gradient >= 0) | (point >= upper) & (expansion.gradient <= 0)
     gradient = jnp.where(held, 0.0, expansion.gradient)
     hessian = jnp.where(held[:, None] | held[None, :], jnp.eye(point.size, dtype=point.dtype), expansion.hessian)

@@ -37,9 +37,10 @@ class Nearest(NamedTuple):
 
 
 def walls_of_cube(walls: Polytope, held: Bool[Array, " d"], point: Float[Array, " d"]) -> Polytope:
-    """The walls and those of the unit cube relative to a `point`: normals v <= offsets for a step v.
+    """The walls and those of the unit cube relative to a `point`: normals v <= offsets for a step v from it.
 
-    The `held` coordinates of v are 0. Offsets are never below 0, for a point of the polytope.
+    Returns k + 2d walls; the `held` coordinates of their normals are 0. Negative offsets (a point slightly outside)
+    become 0.
     """
     unit = jnp.eye(point.size, dtype=point.dtype)
     free = jnp.where(held, 0.0, 1.0).astype(point.dtype)
@@ -49,7 +50,7 @@ def walls_of_cube(walls: Polytope, held: Bool[Array, " d"], point: Float[Array, 
 
 
 def projector(normals: Float[Array, "k d"], active: Bool[Array, " k"]) -> Float[Array, "d d"]:
-    """Projection that removes the components of a vector along the normals of the active walls."""
+    """Matrix (d, d) that removes the components of a vector along the normals of the active walls."""
     rows = jnp.where(active[:, None], normals, 0.0)
     eigenvalues, vectors = eigh(rows.T @ rows)
     free = jnp.where((eigenvalues <= _DEPENDENT)[None, :], vectors, 0.0)
@@ -66,7 +67,7 @@ class _Turned(NamedTuple):
     tolerance: Float[Array, " k"]
 
     def violations(self, multipliers: Float[Array, " k"]) -> Float[Array, " k"]:
-        """Signed violation of each wall at the point with these multipliers."""
+        """Signed violation (k,) of each wall at the point with these multipliers; positive outside the polytope."""
         return self.beyond - self.normals @ (self.normals.T @ multipliers)
 
 
@@ -80,9 +81,10 @@ class _State(NamedTuple):
 
 
 def nearest(walls: Polytope, target: Float[Array, " d"], spread: Float[Array, "d d"]) -> Nearest:
-    """Project the target onto the polytope.
+    """Project the target onto the polytope, which must contain 0.
 
-    `spread` is a square root of the inverse metric, the identity for Euclidean.
+    `spread` is a square root of the inverse metric, the identity for the Euclidean one. Stops after a fixed number of
+    steps, without an error, if rounding causes a cycle.
     """
     normals = walls.normals @ spread
     sizes = jnp.sqrt(jnp.sum(normals**2, axis=1))
@@ -101,7 +103,10 @@ def nearest(walls: Polytope, target: Float[Array, " d"], spread: Float[Array, "d
 
 
 def _step(turned: _Turned, state: _State) -> _State:
-    """One step towards the entering wall: until it is reached, or until an active wall has to leave the set."""
+    """One step towards the entering wall: until it is reached, or until an active wall has to leave the set.
+
+    If no wall is entering, the most violated one is chosen first.
+    """
     left = turned.violations(state.multipliers)
     entering = jnp.where(state.entering >= 0, state.entering, _worst(turned, state, left))
     normal = turned.normals[entering]
@@ -126,7 +131,7 @@ def _step(turned: _Turned, state: _State) -> _State:
 
 
 def _worst(turned: _Turned, state: _State, left: Float[Array, " k"]) -> Int[Array, ""]:
-    """Index of the most violated inactive wall, in units of its normal."""
+    """Index of the most violated inactive wall; `left`: violation (k,) of each, still to be divided by `sizes`."""
     violated = turned.usable & ~state.active & (left > turned.tolerance)
     worst = jnp.argmax(jnp.where(violated, left / jnp.where(turned.usable, turned.sizes, 1.0), -jnp.inf))
     return worst.astype(state.entering.dtype)
@@ -135,7 +140,7 @@ def _worst(turned: _Turned, state: _State, left: Float[Array, " k"]) -> Int[Arra
 def _in_the_span_of(
     normals: Float[Array, "k d"], active: Bool[Array, " k"], normal: Float[Array, " d"]
 ) -> Float[Array, " k"]:
-    """Coefficients (k,) of the active normals whose combination is nearest to a normal (least squares)."""
+    """Coefficients (k,) of the active normals whose combination is nearest to `normal` (least squares); else 0."""
     rows = jnp.where(active[:, None], normals, 0.0)
     gram = rows @ rows.T + jnp.diag(jnp.where(active, 0.0, 1.0).astype(rows.dtype))
     factor = cholesky(gram)

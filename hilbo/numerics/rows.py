@@ -12,7 +12,7 @@ _Tree = TypeVar("_Tree")
 
 
 def rows_of(stacked: _Tree, rows: Int[np.ndarray, " k"]) -> _Tree:
-    """Record with the given rows of all its arrays.
+    """Record with the given rows of all its arrays, as JAX arrays on the default device.
 
     Selected on the host: on the device each shape would compile a small program, which takes longer than the copy.
     """

@@ -24,7 +24,7 @@ _Tree = TypeVar("_Tree", bound=PyTree)
 
 
 def people_mesh() -> Mesh:
-    """Mesh of the devices of all processes, with the one axis "people"."""
+    """New mesh of the devices of all processes, with the one axis "people"; it is not made the current one."""
     return jax.make_mesh((jax.device_count(),), (_AXIS,), axis_types=(AxisType.Auto,))
 
 
@@ -34,10 +34,11 @@ def devices() -> int:
 
 
 def of_each_person(function: Callable[..., Any], people: PyTree, *shared: Any) -> Any:
-    """`function(people, *shared)`, of which each device computes its rows.
+    """`function(people, *shared)`, with the people sharded over the devices: each computes its own rows.
 
-    **Arguments:** `function`: gives arrays with one row for each person that depends on that person alone. It must not
-    close over arrays of a program: they are given as `shared`. `people`: arrays with one row for each person.
+    **Arguments:** `function`: returns arrays with one row for each person that depends on that person alone. It must
+    not close over traced arrays: they are given as `shared`. `people`: arrays with one row for each person. Without a
+    mesh `function` is simply called.
     """
     if devices() == 1:
         return function(people, *shared)
@@ -47,11 +48,10 @@ def of_each_person(function: Callable[..., Any], people: PyTree, *shared: Any) -
 
 
 def sum_over_people(term: Callable[..., Any], people: PyTree, *shared: Any) -> Any:
-    """Sum of `term(person, *shared)` over people, one after the other on each device, so that no two terms are held at
-    once.
+    """Sum of `term(person, *shared)` over people, computed one person after the other on each device.
 
-    **Arguments:** `term`: gives arrays; as the function of `of_each_person`. `people`: arrays with one row for each
-    person. Derivatives take memory for 1,000 people at a time.
+    **Arguments:** `term`: returns arrays, for one person; it must not close over traced arrays. `people`: arrays with
+    one row for each person. Only one term is in memory at a time; derivatives take memory for 1,000 people at a time.
     """
     if devices() == 1:
         return _sum_in_groups(lambda person: term(person, *shared), people)
@@ -65,7 +65,10 @@ def sum_over_people(term: Callable[..., Any], people: PyTree, *shared: Any) -> A
 
 
 def _on_devices(function: Callable[..., Any], out: PartitionSpec) -> Callable[[PyTree, tuple[Any, ...]], Any]:
-    """`function(people, *shared)` on each device's rows of people."""
+    """Function `(people, shared)` that runs `function(people, *shared)` on each device for its own rows of people.
+
+    `out`: how the results are laid out over the devices. What is no array in `shared` is passed as it is.
+    """
 
     def call(people, shared):
         arrays, rest = eqx.partition(shared, eqx.is_array)
@@ -80,18 +83,20 @@ def _on_devices(function: Callable[..., Any], out: PartitionSpec) -> Callable[[P
 
 
 def sharded(people: _Tree) -> _Tree:
-    """The same arrays, their rows sharded over the devices."""
+    """The same arrays, their rows sharded over the devices of the mesh; unchanged without one."""
     return people if devices() == 1 else jax.lax.with_sharding_constraint(people, PartitionSpec(_AXIS))
 
 
 def replicated(arrays: _Tree) -> _Tree:
-    """The same arrays, with a copy on each device."""
+    """The same arrays, with a copy on each device of the mesh; unchanged without one."""
     return arrays if devices() == 1 else jax.lax.with_sharding_constraint(arrays, PartitionSpec())
 
 
 def host_local(arrays: _Tree) -> _Tree:
-    """The same arrays, those that several devices have copies of as arrays of this process alone, for work that other
-    processes do not do."""
+    """The same arrays, but those that lie on several devices copied to this process's default device.
+
+    For work that other processes do not do. The arrays must be replicated.
+    """
 
     def local(leaf):
         several = isinstance(leaf, jax.Array) and len(leaf.sharding.device_set) > 1
@@ -101,6 +106,7 @@ def host_local(arrays: _Tree) -> _Tree:
 
 
 def _count(people: PyTree) -> int:
+    """Number of people: length of the first array."""
     return jax.tree.leaves(people)[0].shape[0]
 
 
@@ -113,11 +119,15 @@ def _padded(people: _Tree) -> _Tree:
 
 
 def _where(counted: Any, terms: Any) -> Any:
+    """The terms where `counted` (a boolean scalar) is true, else zeros; for rows that only pad."""
     return jax.tree.map(lambda leaf: jnp.where(counted, leaf, jnp.zeros_like(leaf)), terms)
 
 
 def _sum_in_groups(term: Callable[[Any], Any], people: Any) -> Any:
-    """Sum over people in their order; in groups above `_GROUP`, of which a derivative computes each again."""
+    """Sum of `term(person)` over people in their order, as a scan.
+
+    Above `_GROUP` people the scan runs in groups whose intermediate values a derivative computes again, to save memory.
+    """
     shape = jax.eval_shape(term, jax.tree.map(lambda leaf: leaf[0], people))
     zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
 

@@ -15,12 +15,12 @@ __all__ = ["check_positive", "concrete", "float_dtype", "floats", "has_values", 
 
 
 def concrete(*values: Any) -> bool:
-    """Whether no leaf of the values is a tracer."""
+    """Whether the values contain no tracer: True outside of `jit`, `grad` and `vmap`."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
 def has_values(*values: Any) -> bool:
-    """Whether all are arrays with values, not tracers or other objects (a tree of `vmap` axes)."""
+    """Whether all values are arrays of JAX or NumPy, and none is a tracer or another object (a tree of `vmap` axes)."""
     return all(isinstance(value, jax.Array | np.ndarray) and not isinstance(value, Tracer) for value in values)
 
 
@@ -42,7 +42,10 @@ def floats(array: Any, dtype: DTypeLike | None = None) -> Any:
 
 
 def numbers(whose: str, name: str, value: Any, dtype: DTypeLike | None = None) -> jax.Array:
-    """A value as a JAX array. Raises `InputError` for non-numeric values and for rows of different lengths."""
+    """Convert a value to a JAX array, of its own dtype or `dtype`. Raises `InputError` if that is impossible.
+
+    That is so for what is not numeric and for rows of different lengths. `whose` and `name` begin the message.
+    """
     try:
         return to_device(value, dtype)
     except (TypeError, ValueError):
@@ -51,14 +54,17 @@ def numbers(whose: str, name: str, value: Any, dtype: DTypeLike | None = None) -
 
 
 def check_positive(whose: str, **values: Any) -> None:
-    """Raise `InputError` for values that are not positive, or not finite. Tracers are not checked."""
+    """Raise `InputError` if one of the named values is, or contains, a number that is not positive or not finite.
+
+    Tracers are not checked. `whose` begins the message.
+    """
     for name, value in values.items():
         if concrete(value) and not np.all((np.asarray(value) > 0) & np.isfinite(value)):
             raise InputError(f"{whose}: {name} is {shown(value)}; it must be a finite number above 0.")
 
 
 def shown(value: Any) -> str:
-    """Text of a value: up to six numbers with four digits; a larger array as dtype and shape."""
+    """Text of a value: up to six numbers with four digits; larger arrays as dtype and shape; others as by `str`."""
     if isinstance(value, Tracer) or not isinstance(value, jax.Array | np.ndarray | np.generic):
         return str(value)
     array = np.asarray(value)

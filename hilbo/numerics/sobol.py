@@ -19,10 +19,11 @@ __all__ = ["scrambled_sobol"]
 def scrambled_sobol(
     key: PRNGKeyArray, replicates: int, count: int, dim: int, dtype: DTypeLike
 ) -> Float[Array, "replicates count dim"]:
-    """Independent scrambles of the first `count` (a power of 2) points of Sobol's sequence, in (0, 1).
+    """Independent scrambles of the first `count` points of Sobol's sequence, in (0, 1)^dim. Raises `InputError`.
 
-    A random lower triangular bit matrix times the generators of each dimension, and a random shift: every point is
-    uniform, and the points of a scramble have the sequence's low discrepancy.
+    `count` must be a power of 2, 2 or more. A random lower triangular bit matrix times the generators of each
+    dimension, and a random shift: every point is uniform, and the points of a scramble have the sequence's low
+    discrepancy.
     """
     bits = min(30, jnp.finfo(dtype).nmant)
     generators = jnp.asarray(_generators(count, dim, bits))  # (levels, dim)

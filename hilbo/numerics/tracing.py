@@ -35,14 +35,16 @@ _keepers: list[Keeper] = []
 
 
 def keep_with(keeper: Keeper | None) -> None:
-    """Set the cache for all programs of this process; None: programs live as long as the process."""
+    """Set the cache of compiled programs for this process; with None, programs live as long as the process."""
     _keepers[:] = [] if keeper is None else [keeper]
 
 
 def program(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorator: compiled as by `eqx.filter_jit`, and kept from one process to the next where a command has set a
-    keeper. Within another trace it is a part of that program. Its results have types of their own, no weak ones; where
-    people are sharded over several devices, each device has a copy of them, and no program is kept."""
+    """Decorator: compile a function as `eqx.filter_jit` does, and take its program from the cache that `keep_with` set.
+
+    A call within another trace becomes part of that program. If people are sharded over several devices the cache is
+    not used, and each device gets a copy of the results. Results never have weak types.
+    """
     typed = _typed(function)
     compiled, copied = eqx.filter_jit(typed), eqx.filter_jit(_copied(typed))
 
@@ -61,10 +63,11 @@ def program(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def prepared(function: Callable, *args: Any) -> OfArrays:
-    """Compiled program of a call, to be called repeatedly with arrays, without the cost of flattening records.
+    """Compile `function(*args)`; return the program as a function of the arrays among `args` (as by `arrays_in`).
 
-    Cached like other programs; without a keeper compiled once for all calls that differ in arrays only. The function
-    must be one of a module, by name; calls must not be part of another trace.
+    It can be called repeatedly without the cost of flattening records; all other arguments are fixed. The program comes
+    from the cache of `keep_with`; without one it is compiled once for all calls that differ in arrays only. The
+    function must be defined in a module, not within another; calls must not be part of another trace.
     """
     typed = _typed(function)
     kept = _keepers[0](typed, args, {}) if _keepers else None
@@ -81,7 +84,10 @@ def arrays_in(what: Any) -> tuple[Any, ...]:
 
 @functools.lru_cache(maxsize=32)
 def _compiled(function: Callable, structure: Any, fixed: tuple[tuple[type, Any] | None, ...]) -> OfArrays:
-    """Jitted function of the arrays among the leaves of the arguments; the other leaves are `fixed`."""
+    """Jitted function of the arrays among the leaves of the arguments, cached in memory.
+
+    `structure`: tree of the arguments; `fixed`: type and value of each leaf that is no array, None for an array.
+    """
 
     def of_arrays(arrays):
         given = iter(arrays)
@@ -92,7 +98,7 @@ def _compiled(function: Callable, structure: Any, fixed: tuple[tuple[type, Any] 
 
 @functools.cache
 def _typed(function: Callable) -> Callable:
-    """The function with results of strong types."""
+    """The same function, but its results have no weak types. Cached, so that equal functions give one object."""
 
     @functools.wraps(function)
     def typed(*args, **kwargs):
@@ -102,7 +108,7 @@ def _typed(function: Callable) -> Callable:
 
 
 def _copied(function: Callable) -> Callable:
-    """The function with results of which each device has a copy."""
+    """The same function, but each device of the mesh gets a copy of the arrays in its results."""
 
     @functools.wraps(function)
     def copied(*args, **kwargs):
@@ -113,10 +119,10 @@ def _copied(function: Callable) -> Callable:
 
 
 def _strong(leaf: Any) -> Any:
-    """Leaf with a strong instead of a weak type."""
+    """The leaf, converted to a strong type if it is an array of a weak type."""
     return jnp.asarray(leaf, leaf.dtype) if getattr(leaf, "weak_type", False) else leaf
 
 
 def _is_array(leaf: Any) -> bool:
-    """Whether a leaf is an array of JAX or NumPy."""
+    """Whether a leaf is an array of JAX or an array or scalar of NumPy."""
     return isinstance(leaf, jax.Array | np.ndarray | np.generic)

@@ -40,10 +40,10 @@ _GONE = 40.0  # exp(-z^2 / 2) is 0 there in float64
 def confined_normal(
     mean: Float[Array, ""], lower: Float[Array, ""], upper: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Log mass of N(mean, 1) between two edges, and shift of the mean and reduction of the variance by truncation.
+    """Log mass of N(mean, 1) between two edges, shift of the mean, and reduction of the variance by the truncation.
 
-    Edges may be infinite. The shift (truncated mean - `mean`) is also the first, and 1 - variance minus the second
-    derivative of the log mass in `mean`.
+    Edges may be infinite. The shift (truncated mean - `mean`) is also the first derivative of the log mass in `mean`;
+    the reduction (1 - variance) is minus the second.
     """
     truncated = truncated_normal(mean, lower, upper, jnp.ones_like(mean))
     return truncated.log_mass, truncated.mean, truncated.curvature
@@ -65,7 +65,10 @@ class TruncatedNormal(NamedTuple):
 def truncated_normal(
     f: Float[Array, ""], lower: Float[Array, ""], upper: Float[Array, ""], noise: Float[Array, ""]
 ) -> TruncatedNormal:
-    """The truncated normal of a latent value and an interval; all arguments scalars, edges may be infinite."""
+    """Log mass, edge densities and cumulants of a standard normal on ((lower - f)/noise, (upper - f)/noise).
+
+    All arguments are scalars, with lower < upper; edges may be infinite. Differentiable to any order.
+    """
     a, b = _standardise(lower, f, noise), _standardise(upper, f, noise)
     mirrored = sum(a) + sum(b) < 0
     low = _Standard(*(jnp.where(mirrored, -v, u) for u, v in zip(a, b, strict=True)))
@@ -99,7 +102,10 @@ def truncated_normal(
 @truncated_normal.defjvp
 @traced_once
 def _derivatives(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[TruncatedNormal, TruncatedNormal]:
-    """Each output's derivative in terms of the outputs; derivations in docs/design.md, "Ordinal likelihood"."""
+    """Derivative rule (JVP) of `truncated_normal`: its output, and the output's tangent in terms of the output.
+
+    `primals`, `tangents`: of f, lower, upper and noise. Derivations in docs/design.md, "Ordinal likelihood".
+    """
     f, lower, upper, noise = primals
     out = truncated_normal(f, lower, upper, noise)
     # An infinite edge has density 0 and does not move; f stands in for it so that no 0 * inf arises, at any order.
@@ -142,7 +148,7 @@ def _choose(
 
 
 class _Edges(NamedTuple):
-    """Something at each of the edges, whose sizes are what the tail and the centre go by."""
+    """A quantity at the lower and the upper edge, such as their distances from 0 or the excess hazards there."""
 
     low: Float[Array, ""]
     high: Float[Array, ""]
@@ -156,7 +162,7 @@ class _Standard(NamedTuple):
 
 
 def _standardise(edge: Float[Array, ""], f: Float[Array, ""], noise: Float[Array, ""]) -> _Standard:
-    """(edge - f) / noise as a short number and its exact remainder.
+    """(edge - f) / noise as a short number and its exact remainder; an infinite edge gives itself and 0.
 
     In the far tail p ~ exp(-z^2 / 2) turns a relative rounding error e of z into e * z^2 of p; the short number has an
     exact square, and the remainder enters to first order.
@@ -175,7 +181,10 @@ def _standardise(edge: Float[Array, ""], f: Float[Array, ""], noise: Float[Array
 
 
 def _narrow(middle: Float[Array, ""], width: Float[Array, ""], product: Float[Array, ""]) -> TruncatedNormal:
-    """Intervals over which the density changes by a bounded factor; `product` = width * middle."""
+    """The truncated normal of a narrow interval, over which the density changes by a bounded factor.
+
+    `middle` and `width` of the standardised interval; `product` = width * middle.
+    """
     steps = 0.5 * width * jnp.asarray(_NODES, middle.dtype)
     heights = jnp.asarray(_WEIGHTS, middle.dtype) * 0.5 * jnp.exp(-middle * steps - 0.5 * steps**2)
     height = jnp.sum(heights)
@@ -194,7 +203,11 @@ def _narrow(middle: Float[Array, ""], width: Float[Array, ""], product: Float[Ar
 
 
 def _tail(edges: _Edges, excesses: _Edges, width: Float[Array, ""], product: Float[Array, ""]) -> TruncatedNormal:
-    """0 <= low: p = Q(low) (1 - R), with E = phi(high) / phi(low) and R = Q(high) / Q(low)."""
+    """The truncated normal for 0 <= low: p = Q(low) (1 - R), E = phi(high) / phi(low), R = Q(high) / Q(low).
+
+    `edges`: low and high; `excesses`: the excess hazards there; `width` = high - low; `product` = width * middle, which
+    is -log E.
+    """
     (low, high), (excess, excess_high) = edges, excesses
     hazard = low + excess
     bounded = ~jnp.isinf(high)
@@ -214,7 +227,10 @@ def _tail(edges: _Edges, excesses: _Edges, width: Float[Array, ""], product: Flo
 def _centre(
     low: _Standard, edges: _Edges, excesses: _Edges, width: Float[Array, ""], product: Float[Array, ""]
 ) -> TruncatedNormal:
-    """low < 0 <= high, -low <= high: the mass outside is a sum of tails, so log p = log1p(-outside) is precise."""
+    """The truncated normal for low < 0 <= high and -low <= high: log p = log1p(-outside), outside = Q(-low) + Q(high).
+
+    `edges`: |low| and high; `excesses`: the excess hazards there; `width` = high - low; `product` = width * middle.
+    """
     short, rest = jnp.abs(low.short), jnp.where(low.short < 0, -low.rest, low.rest)
     rest = jnp.where(short < _GONE, rest, 0.0)  # farther out the density is 0, and the second factor would be infinite
     density = jnp.exp(-0.5 * short**2) * jnp.exp(-rest * (short + 0.5 * rest) - HALF_LOG_2PI)
@@ -233,7 +249,10 @@ def _centre(
 def _cumulants(
     mean: Float[Array, ""], offset: Float[Array, ""], far: Float[Array, ""], width: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Mean, 1 - variance (a sum of non-negative terms) and third cumulant; `width` is 0 where `far` is."""
+    """Mean, 1 - variance (a sum of non-negative terms) and third cumulant of a truncated normal.
+
+    `offset`: mean - low; `far`: density at the upper edge over the mass; `width` = high - low, 0 if high is infinite.
+    """
     curvature = mean * offset + width * far
     skew = curvature * offset - mean * (1.0 - curvature) - width * far * (width - offset)
     return mean, curvature, skew
