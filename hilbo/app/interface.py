@@ -38,7 +38,7 @@ class RunnerInterface(Protocol):
         """Check the awaited condition again."""
 
     def forget(self) -> None:
-        """Treat the rig as having no rendering in force."""
+        """Record that the rig has no rendering in force, so that the next one is prepared again."""
 
 
 @runtime_checkable
@@ -47,7 +47,7 @@ class WatchersInterface(Protocol):
 
     @property
     def participant_here(self) -> bool:
-        """Whether the participant's page is open."""
+        """Whether the participant's page, or a program in its place, has given a sign of life lately."""
         ...
 
 
@@ -110,24 +110,26 @@ class HubInterface(Protocol):
 
     @property
     def fault(self) -> str | None:
-        """What fails in watching for interruptions."""
+        """What fails in watching for interruptions, as a sentence; None while all works."""
         ...
 
     @property
     def draws(self) -> bool:
-        """Whether slices of the map are available."""
+        """Whether the map is compiled, so that slices are available."""
         ...
 
     async def commit(self, make: Callable[[LiveSession, float], Event | None], *, mine: bool = False) -> Any:
-        """Make an event from the newest state, write it to the log, and apply it."""
+        """Call `make(state, time in s)` with the newest state, write the event that it makes to the log, apply it, and
+        return it; None, with nothing written, if it makes none. `mine`: the runner itself asks, and is not restarted.
+        Raises what `make` raises, and `LogError`."""
 
     async def check_log(self) -> None:
-        """Stop the session if its log is lost."""
+        """Check that the log's file is still the open log; set `lost` and stop presenting if it is not."""
         ...
 
     async def map(self) -> dict[str, Any] | None:
-        """Slices of the posterior."""
+        """Slices of the posterior (`Maps.slices`); None if there are none to show, empty before they are compiled."""
         ...
 
     def publish(self) -> None:
-        """Notify all open pages of a change."""
+        """Notify all open pages and programs that there is a newer view."""

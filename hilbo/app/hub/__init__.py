@@ -1,4 +1,4 @@
-"""The hub of a live session, which owns log and state, and what leads, interrupts and commands it.
+"""The hub of a live session: it owns log and state; here too are its runner, interruptions and commands.
 
-One task changes the state; all others ask it to.
+Only the hub changes the state; all others request an event from it.
 """

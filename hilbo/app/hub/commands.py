@@ -1,4 +1,4 @@
-"""What an experimenter may command: each command as the event that it makes, or as a word to the rig."""
+"""The experimenter's commands: most become an event of the log; estop, clear and invite do not."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,18 +20,22 @@ COMMANDS = (
 
 
 class NotNowError(InputError):
-    """What cannot be done now; the view says what can."""
+    """A request that the state of the session does not allow now; the server answers it with the current view."""
 
 
 def others_present(title: str) -> str:
-    """Why somebody is not who presents, by the title of the rig that does."""
+    """An error sentence for a program or person that this session does not use to present renderings. It names what
+    presents instead, by the title of the session's rig: "Stimulus" is a program, "Preparer" a person, any other a
+    device."""
     who = {"Stimulus": "a program presents, and no person", "Preparer": "a person presents, and no program"}
     return f"In this session {who.get(title, 'a device renders, and no program presents')}."
 
 
 async def carry_out(hub: HubInterface, what: str, message: Command) -> dict[str, Any]:
-    """One of `COMMANDS`, in the session of a `Hub`. Raises `NotNowError`, and `InputError` for a message that lacks
-    what the command needs."""
+    """Carry out the command `what`, one of `COMMANDS`, and return the response: the new link for invite, {"done": what}
+    for all others. Estop and clear act on the rig; the others but invite commit an event. Raises `NotNowError` if the
+    session does not allow it or the rig fails, `InputError` for a message that lacks what the command needs, and
+    `LogError`."""
     if what == "estop":
         return await _estop(hub.rig)
     if what == "clear":
@@ -39,14 +43,15 @@ async def carry_out(hub: HubInterface, what: str, message: Command) -> dict[str,
     if what == "invite":
         return _invitation(hub, message)
     try:
-        await hub.commit(_goes_on(hub) if what == "resume" else _event_of(what, message))
+        await hub.commit(_resume_event(hub) if what == "resume" else _event_of(what, message))
     except RefusedError as error:
         raise NotNowError(str(error)) from None
     return {"done": what}
 
 
 def _event_of(what: str, message: Command) -> Callable[[LiveSession, float], Event]:
-    """What makes the event of a command."""
+    """A function of (state, time) that makes the event of a command other than resume, estop, clear and invite, or
+    raises `RefusedError`. Raises `InputError` for an empty note, and for a restore without a trial."""
     if what == "note":
         if not message.text.strip():
             raise InputError("The note is empty; write something.")
@@ -59,7 +64,7 @@ def _event_of(what: str, message: Command) -> Callable[[LiveSession, float], Eve
     if what == "skip":
         return lambda state, at: actions.skip(state, message.reason, at, message.trial)
     if what in ("void", "undo"):
-        return lambda state, at: _taken(state, what, message, at)
+        return lambda state, at: _void_or_undo(state, what, message, at)
     if what == "abort":
         return lambda state, at: actions.abort(state, message.reason, at)
     if what == "pause":
@@ -67,8 +72,10 @@ def _event_of(what: str, message: Command) -> Callable[[LiveSession, float], Eve
     return actions.repeat
 
 
-def _goes_on(hub: HubInterface) -> Callable[[LiveSession, float], Event]:
-    """From a break, or from the end of a block, as whoever is there by then."""
+def _resume_event(hub: HubInterface) -> Callable[[LiveSession, float], Event]:
+    """A function of (state, time) that makes the event of the command resume: the end of the break or, without a break,
+    the start of the next block. It also sets `hub.begun` to whether the participant's page is open; if not, they must
+    press Begin."""
 
     def make(state, at):
         event = (actions.resume if state.paused is not None else actions.go_on)(state, at)
@@ -78,8 +85,9 @@ def _goes_on(hub: HubInterface) -> Callable[[LiveSession, float], Event]:
     return make
 
 
-def _taken(state: LiveSession, what: str, message: Command, at: float) -> Event:
-    """A trial made void, or an answer taken back: that of the trial which the sender saw, or none."""
+def _void_or_undo(state: LiveSession, what: str, message: Command, at: float) -> Event:
+    """The event that voids the trial presented now or answered last (`what` is "void"), or takes the last answer back
+    ("undo"). Raises `RefusedError` if there is no such trial, or if the message names another one."""
     trial = state.voidable if what == "void" else state.last_answered
     if trial is None:
         raise RefusedError("nothing", f"There is no trial to {what} yet.")
@@ -91,7 +99,8 @@ def _taken(state: LiveSession, what: str, message: Command, at: float) -> Event:
 
 
 def _invitation(hub: HubInterface, message: Command) -> dict[str, str]:
-    """A new link for a role that this session has."""
+    """A new link for the message's role, as `hub.invite` returns it. Earlier unused links of the role become void.
+    Raises `NotNowError` if the hub gives no links, or the session does not have this role."""
     if hub.invite is None:
         raise NotNowError("This session gives no links.")
     stimulus = hub.state.study.stimulus
@@ -101,6 +110,8 @@ def _invitation(hub: HubInterface, message: Command) -> dict[str, str]:
 
 
 async def _estop(rig: Rig) -> dict[str, str]:
+    """Stop the rig at once, and return {"done": "estop"}. Raises `NotNowError` if the rig fails or does not
+    acknowledge."""
     try:
         await rig.estop()
     except (RuntimeError, ValueError) as error:
@@ -109,6 +120,7 @@ async def _estop(rig: Rig) -> dict[str, str]:
 
 
 async def _clear(rig: Rig) -> dict[str, str]:
+    """Have the rig leave HOLD or ESTOP, and return {"done": "clear"}. Raises `NotNowError` if it cannot."""
     try:
         await rig.clear()
     except (RuntimeError, ValueError) as error:

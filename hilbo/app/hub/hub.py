@@ -1,10 +1,11 @@
-"""The one place that changes a live session: it owns the log, the state, the device and the choosing.
+"""The hub of a live session, the only place that changes it: it owns the log, the state, the rig and the chooser.
 
-    page or program --> answer / press / command --> event --> log (fsync) --> state --> views to everybody
+    page or program --> answer / press / command --> event --> log (fsync) --> state --> views to all pages
 
-Events are made one after the other, and one counts only when it is on the disk: then the state moves on, the sender is
-told, and the next proposal is made. Threads work beside the event loop: the disk's, a device's (`device_rig`), the
-choosing's, and the server's own. What a participant does next is in `runner`, what comes between in `interruptions`.
+Events are made one at a time, and an event counts only once it is on the disk: then the state advances, the sender gets
+its response, and the next trial is proposed. Beside the event loop there are threads for the disk, a device
+(`device_rig`), the choice of trials and the map. `runner` presents the trials, `interruptions` handles what interrupts
+them.
 """
 
 import asyncio
@@ -38,13 +39,13 @@ Result = TypeVar("Result")
 
 
 class Hub:
-    """A session being held. `log` is its `EventLog`, `chooser` proposes, `connect` makes the rig that shows renderings
-    (given what is to be told of each new snapshot, and of what it says unasked), `maps` makes what draws the slices of
-    the chooser's posterior.
+    """A live session. `log` is its open `EventLog`, which it does not close; `chooser` proposes trials;
+    `connect(changed, notice)` makes the rig, which calls `changed` with each new snapshot and `notice` with each
+    sentence that a device sends unasked; `maps(chooser)` makes the `Maps`, None for a session without a map.
 
-    `invite`, once set, makes a new link for a role; `settle`, once set, is called when all that is needed is compiled,
-    before anything is rendered; `gap` (s) is the pause between two trials, `tag` is what trials of this session are
-    known by in browsers.
+    `invite`, once set, makes a new link for a role; `settle`, once set, is called when everything is compiled, before
+    anything is presented; `gap` (s) is the pause between two trials; `tag` is the prefix of the trials' names in
+    browsers.
     """
 
     def __init__(
@@ -83,7 +84,8 @@ class Hub:
     # Life.
 
     async def open(self) -> None:
-        """Connect to the rig, and begin. Raises `InputError` or `DeviceError`."""
+        """Connect the rig (in a thread), start to compile (in another), log the rig's state, start to watch for
+        interruptions and to present. Raises `InputError` or `DeviceError` if the rig cannot be connected."""
         self._lock, self._loop = asyncio.Lock(), asyncio.get_running_loop()
         rig = await self._loop.run_in_executor(self._disk, lambda: self._connect(self._from_rig, self._noticed))
         self._rig = rig
@@ -93,7 +95,8 @@ class Hub:
         self.runner.restart()
 
     def _warm(self) -> None:
-        """Compile what choosing and drawing need; nothing is rendered before it is done."""
+        """Compile what choosing and the map need; called in the thread of the choices. If the map fails, `without_map`
+        says why and the session has no map; what the chooser raises is raised."""
         self.chooser.warm()
         if self._make_maps is None:
             return
@@ -106,13 +109,16 @@ class Hub:
             self.without_map = f"There will be no map ({why}); the session goes on without it."
 
     def _warmed(self, warm: asyncio.Future) -> None:
+        """Call `settle` and notify the pages: the callback at the end of compilation, also if that failed, but not if
+        it was cancelled."""
         if warm.cancelled():  # the session ends before it
             return
         self.settle()
         self.publish()
 
     async def close(self) -> None:
-        """Stop the rig, let go of everything."""
+        """End the session's work: stop watching and presenting, end all streams, close the rig and the hub's threads.
+        The log stays open."""
         self._interruptions.end()
         self.runner.cancel()
         if self._warming is not None:
@@ -126,13 +132,13 @@ class Hub:
 
     @property
     def rig(self) -> Rig:
-        """What shows renderings, from `open` on."""
+        """The rig, which presents the renderings; only after `open`."""
         assert self._rig is not None
         return self._rig
 
     @property
     def warm(self) -> asyncio.Future:
-        """Done when all that is needed is compiled; from `open` on."""
+        """The future of the compilation, done when everything is compiled; only after `open`."""
         assert self._warming is not None
         return self._warming
 
@@ -140,18 +146,23 @@ class Hub:
 
     @property
     def fault(self) -> str | None:
-        """What of the watch over the session does not work."""
+        """What fails in watching for interruptions, as a sentence; None while all works."""
         return self._interruptions.fault
 
     async def commit(self, make: Callable[[LiveSession, float], Any], *, mine: bool = False) -> Any:
-        """Have an event made from the newest state, on the disk, and counted; None if there is none to make.
+        """Call `make(state, time in s since the epoch)` with the newest state, write the event that it makes to the
+        log, apply it, notify the pages, and return it; None, with nothing written, if it makes none. One commit runs at
+        a time.
 
-        `mine`: the runner itself asks, and goes on by itself. Raises `RefusedError`, or `LogError`. Whoever waits for
-        it may give up: the event is finished all the same, so that log and state never part.
+        The runner is restarted if the event changes what is to be presented, unless `mine` says that the runner itself
+        asks. Raises what `make` raises (`RefusedError`), and `LogError` if the event is not on the disk. A cancelled
+        caller does not cancel the commit, so that log and state always agree.
         """
         return await asyncio.shield(asyncio.ensure_future(self._commit(make, mine)))
 
     async def _commit(self, make, mine):
+        """`commit`, but cancelled with its caller. After an answer it also gives the runner the times from which the
+        delay to the next rendering is computed."""
         assert self._lock is not None
         async with self._lock:
             event = make(self.state, time.time())
@@ -169,14 +180,16 @@ class Hub:
         return event
 
     async def check_log(self) -> None:
-        """Stop the session if its log is lost (`EventLog.check`)."""
+        """Check that the log's file is still the open log (`EventLog.check`). If it is not, set `lost` and `alert` and
+        restart the runner, which then presents nothing; raises nothing."""
         assert self._lock is not None
         async with self._lock:
             with contextlib.suppress(LogLostError):
                 await self._on_disk(self.log.check)
 
     async def _on_disk(self, work: Callable[..., Result], *arguments: object) -> Result:
-        """The result of work on the log, in the disk's thread. Raises `LogError`, of which the experimenter is told."""
+        """Return the result of `work(*arguments)`, called in the disk's thread. A `LogError` is shown to the
+        experimenter (`alert`) and raised again; the first `LogLostError` also sets `lost` and restarts the runner."""
         try:
             return await self._loop.run_in_executor(self._disk, work, *arguments)
         except LogError as error:
@@ -189,23 +202,24 @@ class Hub:
             raise
 
     def hang_up(self) -> None:
-        """The server ends: nobody waits for news."""
+        """End all streams of views and all waiting requests of the rig, since the server ends."""
         self.watchers.end_all()
         if self._rig is not None:
             self._rig.hang_up()
 
     def publish(self) -> None:
-        """Tell everybody who looks that there is news."""
+        """Notify all open pages and programs that there is a newer view."""
         self.watchers.tell()
 
     # What pages and programs ask for.
 
     def text(self, key: str) -> str:
-        """What participants read, in the study's language."""
+        """The participant's text for a key, in the study's own words or language."""
         return self.state.study.session.text(key)
 
     def view(self, role: Role) -> dict[str, Any]:
-        """What a role may see now."""
+        """What a role may see now, as a dict for JSON; without parameters for a blind experimenter, and empty for a
+        stimulus program or preparer, who receive orders instead."""
         if role == "participant":
             return views.participant(self)
         if role != "experimenter":  # who presents is given orders, and has no view
@@ -214,7 +228,10 @@ class Hub:
         return blind.experimenter(self, seen) if self._blinds else seen
 
     async def answer(self, message: Answer, page: str | None) -> dict[str, Any]:
-        """A participant's answer, accepted once; on the disk when this returns. Raises `NotNowError`."""
+        """Log a participant's answer. Returns {"accepted": name of the trial, "again": whether this same answer was in
+        the log before}, once it is on the disk. `page`: id of the browser window, None for a program. Raises
+        `NotNowError` for a window that is not the newest, a trial of another session, and an answer that is refused;
+        `LogError`."""
         self._check_page(page)
         trial, presentation = self._trial_of(message.trial)
         times = {"response_s": message.response_ms, "shortest_s": message.shortest_ms}
@@ -240,7 +257,9 @@ class Hub:
         return {"accepted": message.trial, "again": event is None}
 
     async def press(self, what: str, message: Press, page: str | None) -> None:
-        """A participant's button, or their page's sign of life. Raises `NotNowError`."""
+        """Carry out a participant's button: "break", "more" (another warm-up trial), "here" (sign of life of the page),
+        else begin: start the next block after the warm-up, or else let the runner present. `page` as in `answer`; the
+        message is not used. Raises `NotNowError`, `LogError`."""
         self._check_page(page)
         try:
             if what == "here":
@@ -258,12 +277,14 @@ class Hub:
             raise NotNowError(str(error)) from None
 
     async def command(self, what: str, message: Command) -> dict[str, Any]:
-        """An experimenter's command. Raises `NotNowError`."""
+        """Carry out an experimenter's command and return the response (`commands.carry_out`). Raises `NotNowError`,
+        `InputError`, `LogError`."""
         return await commands.carry_out(self, what, message)
 
     async def map(self) -> dict[str, Any] | None:
-        """Slices of the posterior, made once for each state of the answers; None where there is nothing to show, empty
-        while they are being prepared."""
+        """Slices of the posterior (`Maps.slices`), computed once for each state of the answers and the pending trial;
+        then `trust` is computed too, and the pages are notified. None if the experimenter is blind or no trials are
+        chosen; empty while there is no compiled map."""
         state = self.state
         version = views.map_version(state)
         if self._blinds:
@@ -278,20 +299,23 @@ class Hub:
 
     @property
     def _blinds(self) -> bool:
-        """Whether the experimenter is not to know the parameters."""
+        """Whether the experimenter must not see parameters: the study has a [stimulus] that is not shown to them."""
         stimulus = self.state.study.stimulus
         return stimulus is not None and "experimenter" not in stimulus.shown_to
 
     @property
     def draws(self) -> bool:
-        """Whether there are slices to be had."""
+        """Whether the map is compiled, so that slices are available."""
         return self._maps is not None
 
     def _check_page(self, page) -> None:
+        """Raise `NotNowError` unless the participant's window `page` is the newest; None, a program, always passes."""
         if not self.watchers.counts(page):
             raise NotNowError(self.state.study.session.text("moved"))
 
     def _trial_of(self, name: str) -> tuple[int, int]:
+        """Id and presentation of a trial, from its name in browsers, `tag:id.presentation`. Raises `NotNowError` for
+        another session's name, and for text of another form."""
         tag, _, numbers = name.rpartition(":")
         trial, _, presentation = numbers.partition(".")
         if tag != self.tag or not (trial.isdecimal() and presentation.isdecimal() and len(numbers) < 16):
@@ -301,7 +325,9 @@ class Hub:
     # What the rig's thread tells.
 
     def _from_rig(self, seen: Snapshot) -> None:
+        """Hand a new snapshot, from the rig's thread, to the event loop."""
         self._loop.call_soon_threadsafe(self._interruptions.device_changed, seen)
 
     def _noticed(self, sentence: str) -> None:
+        """Notify the pages, from the rig's thread, after a sentence of the device; the sentence itself is not kept."""
         self._loop.call_soon_threadsafe(self.publish)

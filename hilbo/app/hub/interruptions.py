@@ -1,9 +1,9 @@
-"""Interruptions of a session: by its device, a laptop that slept, a participant who left, a hand that does not leave.
+"""Interruptions of a session: by its device, by a laptop that slept, by a participant's page that was closed.
 
     device, clocks, signs of life --> event in the log --> the runner restarts
 
-The rig reports what a device does (lost, HOLD, E-STOP, ready again); here that becomes an event of the pending trial.
-After an interruption the participant must press Begin.
+The rig reports what happens to a device (lost, HOLD, ESTOP, ready again); here that becomes an event of the pending
+trial. After an interruption the participant must press Begin.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ _GONE = 3.0  # s without a participant's page until a trial that is being felt i
 
 
 class Interruptions:
-    """Watches for interruptions of a `Hub`, from `begin` to `end`."""
+    """Watches a `Hub` for interruptions, from `begin` to `end`: once a second, and at each change of the device."""
 
     hub: HubInterface
 
@@ -45,39 +45,41 @@ class Interruptions:
         self._here, self._absent = False, None  # whether the participant's page is, and since when it is not
 
     async def begin(self, seen: Snapshot) -> None:
-        """Log the device's state, and start to watch."""
+        """Log the device's condition when the session opens, and start to watch clock, page and log once a second."""
         await self._device_changed(seen, opening=True)
         self._wall, self._steady = time.time(), time.monotonic()
         self._spawn(self._watch("time", self._look))
         self._spawn(self._watch("log", self.hub.check_log))
 
     def end(self) -> None:
-        """Stop watching."""
+        """Cancel all watching; device events that are not on the disk are lost."""
         for task in self._tasks:
             task.cancel()
 
     @property
     def fault(self) -> str | None:
-        """What fails in watching, as a sentence, until it works again."""
+        """What fails in watching, as a sentence; None while all works."""
         return next(iter(self._faults.values()), None)
 
     def device_changed(self, seen: Snapshot) -> None:
-        """Handle a change of the device that was not requested; it concerns the trial pending at that moment."""
+        """Handle a new snapshot of the rig in a task of its own: log a changed condition as an event of the trial that
+        is pending now, and notify the pages."""
         self._spawn(self._device_changed(seen))
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run `work` as a task that is cancelled by `end`; its exception becomes `fault`."""
         task = asyncio.ensure_future(work)
         self._tasks.append(task)
         task.add_done_callback(self._ended)
 
     def _ended(self, task: asyncio.Task) -> None:
-        """Report the exception of a task, if there is one."""
+        """Callback at the end of a task: forget it, and set (or clear) the fault "device" by its exception."""
         self._tasks.remove(task)
         if not task.cancelled():
             self._set_fault("device", task.exception())
 
     def _set_fault(self, what: str, error: BaseException | None) -> None:
-        """Set or clear the fault of one kind of watch, and publish a change."""
+        """Set the fault of one kind of watch, or clear it (`error` None); the pages are notified if `fault` changes."""
         before = self.fault
         self._faults.pop(what, None)
         if error is not None:
@@ -87,6 +89,8 @@ class Interruptions:
             self.hub.publish()
 
     async def _device_changed(self, seen: Snapshot, *, opening: bool = False) -> None:
+        """Log the device's condition if it has changed, and notify the pages in any case. A lost device restarts the
+        runner, and the participant must press Begin again. `opening`: the session has just opened."""
         hub, condition = self.hub, _condition_of(seen)
         if condition != self._condition:
             self._condition = condition
@@ -100,7 +104,8 @@ class Interruptions:
         hub.publish()
 
     async def _write(self) -> None:
-        """Write the device's events to the log in order; while the disk is full they wait."""
+        """Commit the waiting device events in order. One that is refused is dropped; after a `LogError` (such as a full
+        disk) it and the later ones wait for the next call."""
         async with self._writing:
             while self._unwritten:
                 with contextlib.suppress(InputError):
@@ -122,7 +127,8 @@ class Interruptions:
                 self._set_fault(what, error)
 
     async def _look(self) -> None:
-        """One check for a laptop that slept, for unwritten events, and for the participant's page."""
+        """One check: interrupt after the clock jumped by more than `_JUMP` s; commit waiting device events; notify the
+        pages if the participant's page came or went; interrupt if it has been away for `_GONE` s since Begin."""
         hub, now, mono = self.hub, time.time(), time.monotonic()
         slept = max(abs((now - self._wall) - (mono - self._steady)), mono - self._steady - _LATER)
         self._wall, self._steady = now, mono
@@ -142,7 +148,9 @@ class Interruptions:
 
 
 async def interrupt(hub: HubInterface, why: str) -> None:
-    """Interrupt the presentation, which restarts once Begin is pressed. `why`: a note in the log."""
+    """Interrupt the presentation: note `why` in the log, have an unfinished pending trial begin again, and restart the
+    runner, which presents after Begin is pressed. Events that are refused or cannot be written are left out
+    silently."""
     pending, hub.begun = hub.state.pending, False
     with contextlib.suppress(InputError, LogError):
         await hub.commit(lambda state, at: actions.note(state, why, at))
@@ -152,14 +160,16 @@ async def interrupt(hub: HubInterface, why: str) -> None:
 
 
 def _condition_of(seen: Snapshot) -> str:
-    """ "lost", "hold", "estop" or "ready"."""
+    """The condition of a device as events name it: "lost", "hold", "estop", or "ready" in all other states."""
     return "lost" if seen.lost else _STOPPED.get(seen.state, "ready")
 
 
 def _device_event(seen: Snapshot, condition: str, pending: Any, opening: bool) -> Callable[[LiveSession, float], Any]:
-    """Makes the event of a device's new condition, for the trial that is pending now.
+    """A function of (state, time) that makes the event of a device's condition, with its facts and the id of `pending`,
+    the trial pending now or None.
 
-    A HOLD that began because an earlier server was killed voids nothing.
+    A HOLD that a killed server left behind (`excused`, when the session opens) is logged as "stopped", which voids no
+    trial.
     """
     facts = {"trial": None if pending is None else pending.id, "reason": seen.lost or seen.reason, **seen.facts}
     says = "stopped" if opening and seen.excused else condition

@@ -1,4 +1,4 @@
-"""From what was asked for on the command line to a hub: study, plan, log, choosing; compiled before the device runs."""
+"""Make the hub of a session from the options of the command line: study, plan, log and chooser."""
 
 import functools
 import gc
@@ -33,7 +33,7 @@ __all__ = ["Wanted", "let_go", "opened"]
 
 
 class Wanted(NamedTuple):
-    """A session as a person asks for it; None: as the plan, the log or the default has it."""
+    """A session as the command line asks for it. None: as the plan or the log has it, else the default."""
 
     study: Path
     participant: str
@@ -53,8 +53,10 @@ class Wanted(NamedTuple):
 def opened(
     wanted: Wanted, connect: Callable[[float | None, float | None], Any], say: Callable[[str], Any]
 ) -> tuple[Hub, EventLog]:
-    """The hub of a session, new or resumed, and its open log; `connect(damping, delay)` opens a device that has at
-    least this damping (N·s/m) and at most this delay (s). Raises `InputError`."""
+    """The hub of a session, new or resumed, not yet open, and its open log, which for a new session is created. Opening
+    the hub calls `connect(damping, delay)`, which connects a device with at least this damping (N·s/m) and at most this
+    delay (s); a study with [stimulus] has no device. `say` is told of progress. Raises `InputError`, with the log
+    closed and, if new, deleted."""
     study = Study.load(wanted.study).file
     say("preparing what chooses")
     import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
@@ -78,25 +80,29 @@ def opened(
 
 
 def _set_memory_aside() -> None:
-    """Leaves what is in memory by now out of all later garbage collections. To look through it takes 0.1 s, in which
-    nobody is heard. Only for a process that ends with its session: what is left out is never freed."""
+    """Exclude all objects that exist now from garbage collection, after one collection: a later one would take 0.1 s,
+    in which the server answers nobody. Only for a process that ends with its session, because these objects are never
+    freed."""
     gc.collect()
     gc.freeze()
 
 
 def let_go(log: EventLog, resumed: bool = False) -> None:
-    """Close a log. A new one in which nothing has happened is removed, so that the same command may begin it."""
+    """Close a log. One that was not `resumed` and has no event is deleted, so that the same command can begin it
+    again."""
     log.close()
     if not resumed and log.state.seq == 0:
         log.path.unlink(missing_ok=True)
 
 
 def _mechanics(study: StudyFile, material: str | None) -> Any:
+    """The mechanics of the study's renderer for a material; None for a study without a renderer."""
     return study_of(study, material).space.mechanics
 
 
 def _begun(wanted: Wanted, study: StudyFile) -> tuple[EventLog, LiveChooser]:
-    """A new log, last of all: what is refused leaves none behind."""
+    """A new log and its chooser. The log is created last, so that a refused session leaves no file. Raises `InputError`
+    if the session was begun before, or its options do not fit study or plan."""
     if wanted.plan is None and wanted.material is None and study.materials:
         names = ", ".join(study.materials)
         raise InputError(
@@ -112,6 +118,8 @@ def _begun(wanted: Wanted, study: StudyFile) -> tuple[EventLog, LiveChooser]:
 
 
 def _resumed(wanted: Wanted, study: StudyFile) -> tuple[EventLog, LiveChooser]:
+    """The log of a session that was begun before, opened for writing, and its chooser. Raises `InputError`, with the
+    log closed, if it was begun with other options, or as a dry run and is resumed as none, or the reverse."""
     header = _header(wanted._replace(dry_run=True), study)  # consent was looked for when it began
     log = EventLog.resume(wanted.logs / log_name(header), study)
     try:
@@ -129,7 +137,8 @@ def _resumed(wanted: Wanted, study: StudyFile) -> tuple[EventLog, LiveChooser]:
 
 
 def _check_asked_for(wanted, header: Header, log: EventLog) -> None:
-    """Refuse a log that is of somebody else, or was begun with another material, seed or plan than asked for."""
+    """Raise `InputError` if the log belongs to another participant or session, or was begun with another material, seed
+    or plan than the options give; `header` is that of a new session with these options. Options that are None pass."""
     begun = log.state.header
     if (begun.participant, begun.session) != (header.participant, header.session):
         raise InputError(
@@ -145,6 +154,9 @@ def _check_asked_for(wanted, header: Header, log: EventLog) -> None:
 
 
 def _header(wanted: Wanted, study: StudyFile) -> Header:
+    """The header of the session: from the row of the participant in the plan, else an optimisation of one material.
+    Unless it is a dry run or `hilbo try`, the participant's consent is looked up in participants.csv. Raises
+    `InputError` if it is missing, or plan, study and options do not fit."""
     number = study.session.protocol_number
     facts: dict[str, Any] = {"protocol_number": number, "versions": _versions()}
     if study.stimulus is not None:
@@ -171,9 +183,10 @@ def _header(wanted: Wanted, study: StudyFile) -> Header:
 
 
 def _as_asked(wanted, header: Header) -> Header:
-    """A planned header, under the label that was asked for. Another seed or material than the plan's is refused.
+    """A planned header with the session label of the options, if there is one. Raises `InputError` if the options have
+    another seed or material than the plan.
 
-    With a label of its own somebody whose session was ended by accident goes through the same plan again.
+    With a label of its own, a session that was ended by accident can be run again by the same plan.
     """
     where = f"{wanted.plan}: plans the session of {wanted.participant}"
     if wanted.seed not in (None, header.seed):
@@ -185,12 +198,13 @@ def _as_asked(wanted, header: Header) -> Header:
 
 
 def _materials(header: Header) -> list[str]:
-    """The materials of a session, as they come."""
+    """The materials of a session in order, each once; "none" for blocks without a material."""
     return list(dict.fromkeys(block.material or "none" for block in header.blocks))
 
 
 def _warm_starts(wanted: Wanted, study: StudyFile, header: Header) -> dict[str | None, Any]:
-    """Material -> what its choices begin with. The candidates are those of the session's seed, not of the command's."""
+    """Material -> the warm start of its choices, empty without --warm-start; candidates by the seed of the header.
+    Raises `InputError` if all trials are planned, or the file does not fit."""
     if wanted.warm_start is None:
         return {}
     materials = {block.material for block in header.blocks if not block.trials}
@@ -202,9 +216,10 @@ def _warm_starts(wanted: Wanted, study: StudyFile, header: Header) -> dict[str |
 
 
 def _versions() -> dict[str, str]:
+    """Installed versions of hilbo, jax, jaxlib and numpy, by name."""
     return {part: metadata.version(part) for part in ("hilbo", "jax", "jaxlib", "numpy")}
 
 
 def _tag(header: Header) -> str:
-    """What this session's trials are known by in browsers."""
+    """A digest of the header (12 hexadecimal digits), the prefix of the trials' names in browsers."""
     return hashlib.sha256(msgspec.json.encode(header)).hexdigest()[:12]

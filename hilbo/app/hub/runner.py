@@ -1,10 +1,10 @@
 """The task that presents trials: propose, prepare, present step by step, wait for the answer.
 
 It is restarted whenever an event changes what is to be presented (an answer, a break, an undo, a HOLD …). The rig
-prepares a rendering while the reference or nothing is presented, and a step begins when the rig reports that it shows
-it. Nothing is presented before Begin, nor during compilation; otherwise the rig rests. A hand that blocks the start of
-a rendering is asked to leave; if it stays, the presentation is interrupted. During a presentation the next proposal is
-computed for every possible answer, so that after the answer it is only looked up.
+prepares a rendering while the reference or nothing is presented, and a step begins when the rig reports that it is
+presented. Nothing is presented before Begin, nor during compilation; otherwise the rig rests. A hand that blocks the
+start of a rendering is asked to leave; if it stays, the presentation is interrupted. During a presentation the next
+proposal is computed for every possible answer, so that after the answer it is only looked up.
 """
 
 import asyncio
@@ -29,12 +29,13 @@ _LEAVES = 20.0  # s that it may stay after that, until the presentation is inter
 
 
 class HandError(RuntimeError):
-    """The hand did not leave the device in time."""
+    """The participant's hand did not leave the device in time."""
 
 
 class Runner:
-    """The task of a `Hub` that presents trials: `stage` is what it does now, `ends` when the step ends (s,
-    monotonic)."""
+    """The task of a `Hub` that presents trials. `stage`: what it does now ("idle", "choosing", "hello", "between",
+    "let-go", "showing", "step", "answer" or "trouble"); `step`: index of the step that is presented; `ends`: when that
+    step ends (s, monotonic); `trouble`: why it does not continue."""
 
     hub: HubInterface
 
@@ -56,18 +57,19 @@ class Runner:
         self.fits_after = 0  # fits that a participant had to wait for
 
     def key(self) -> tuple:
-        """Identifies what is to be presented now; when it changes, the task restarts."""
+        """What identifies the presentation due now: the screen, and id and presentation number of the pending trial.
+        When it changes, the task restarts."""
         pending = self.hub.state.pending
         return self.hub.state.screen, pending and (pending.id, pending.presentation)
 
     def restart(self) -> None:
-        """Cancel the present work and start again from the current state."""
+        """Cancel the present work and start a task that works from the current state."""
         self.cancel()
         self._stop = asyncio.Event()
         self._task = asyncio.create_task(self._run(self._stop))
 
     def cancel(self) -> None:
-        """Cancel the present work."""
+        """Cancel the present work, if any; the stage becomes "idle"."""
         self._stop.set()
         if self._task is not None:
             self._task.cancel()
@@ -75,34 +77,36 @@ class Runner:
         self.stage, self.step, self._asked = "idle", None, None
 
     def wake(self) -> None:
-        """Check the awaited condition again."""
+        """Have the task check the condition that it waits for (Begin, or the rig) again."""
         self._wake.set()
 
     def forget(self) -> None:
-        """Treat the rig as having no rendering in force."""
+        """Record that the rig has no rendering in force, so that the next one is prepared again."""
         self._in_force = None
 
     async def _run(self, stop: asyncio.Event) -> None:
-        """Work until only an event from outside can change the state; errors are shown, and it is tried again."""
+        """Work until only an event from outside can change the state. A missed step voids its trial, a hand that stays
+        interrupts the trial, any other error becomes `trouble`; then the task restarts itself, unless `stop` is set."""
         try:
             try:
                 await self._lead()
             except MissedError as error:
                 await self._missed(str(error))
-                self._again(stop)
+                self._schedule_restart(stop)
             except HandError as error:
                 await interrupt(self.hub, str(error))
         except RefusedError:  # the state has changed meanwhile, and with it what is to be done
             await asyncio.sleep(_SOON)
-            self._again(stop)
+            self._schedule_restart(stop)
         except Exception as error:  # whatever it is, the experimenter is told, and it is tried again
             self.trouble = str(error) or type(error).__name__
             self._at("trouble")
             await asyncio.sleep(_LATER)
-            self._again(stop)
+            self._schedule_restart(stop)
 
     async def _lead(self) -> None:
-        """Propose and present, as far as the state allows."""
+        """Propose and present trials until an answer or another event is awaited. The rig is set to rest unless a trial
+        is due and Begin was pressed. With a lost log it only shows the trouble."""
         hub = self.hub
         if hub.lost:
             await hub.rig.rest()
@@ -119,31 +123,34 @@ class Runner:
             else:
                 trial = hub.state.pending
                 assert trial is not None  # as the screen says
-                if await self._warmed_up_again() or not await self._present(trial):
+                if await self._warm_up_due() or not await self._present(trial):
                     continue
                 return
         self._at("idle")
 
-    async def _warmed_up_again(self) -> bool:
-        """Whether the warm-up has to come again after a pause, which is logged then."""
+    async def _warm_up_due(self) -> bool:
+        """Whether the warm-up is due again after a long pause; if so, its event is committed."""
         if not self.hub.state.warms_up_again(time.time()):
             return False
         await self.hub.commit(actions.warm_up, mine=True)
         return True
 
-    def _again(self, stop: asyncio.Event) -> None:
-        """Restart, unless that was done already."""
+    def _schedule_restart(self, stop: asyncio.Event) -> None:
+        """Schedule a restart of the task, unless `stop` is set: then it was cancelled already."""
         if not stop.is_set():
             asyncio.get_running_loop().call_soon(self.restart)
 
     def _at(self, stage: str, step: int | None = None, seconds: float = 0.0) -> None:
+        """Set the stage, the index of the step and its end, `seconds` from now; clear `trouble` unless the stage is
+        "trouble"; notify the pages."""
         self.stage, self.step, self.ends = stage, step, time.monotonic() + seconds
         if stage != "trouble":
             self.trouble = ""
         self.hub.publish()
 
     async def _propose(self) -> None:
-        """The next trial, in the log; chosen in the choosing's thread."""
+        """Choose the next trial in the thread of the choices and commit its proposal. Raises `RefusedError` if
+        meanwhile another trial is due."""
         hub = self.hub
         state = hub.state
         loop = asyncio.get_running_loop()
@@ -164,8 +171,9 @@ class Runner:
         self.clock["proposed"] = time.perf_counter()
 
     async def _present(self, trial: Trial) -> bool:
-        """Present the steps of a trial; after a break or a restart of the server they may all be done already. False if
-        nothing was presented, since the warm-up comes again."""
+        """Present the steps of a trial, after Begin and the pause between trials; returns once it can be answered, at
+        once if all steps were presented before. Returns False, with the steps not presented, if the warm-up is due
+        again."""
         hub = self.hub
         if trial.step is not None and not trial.unfinished:
             self._look_ahead()
@@ -181,7 +189,7 @@ class Runner:
                 self._wake.clear()
                 self._at("hello")
                 await self._wake.wait()
-            if await self._warmed_up_again():  # Begin was pressed long after
+            if await self._warm_up_due():  # Begin was pressed long after
                 return False
             if not self._differs:
                 self._look_ahead()
@@ -201,7 +209,8 @@ class Runner:
         return True
 
     async def _step(self, trial: Trial, i: int, show: Any, seconds: float) -> None:
-        """Present step `i` for so many seconds."""
+        """Have the rig show step `i`, `show`, and present it for `seconds` s; its begin and end are logged. Raises
+        `MissedError` if the rig cannot show it, `HandError`, `RefusedError`."""
         commit = self.hub.commit
         self._showing = self._showing_of(trial, i, show)
         shown = asyncio.ensure_future(self.hub.rig.show(self._showing))
@@ -211,15 +220,15 @@ class Runner:
             shown.cancel()
         self._asked = None
         if loaded is not None:
-            await self._in_log(trial, show, loaded)
+            await self._log_in_force(trial, show, loaded)
         await commit(lambda state, at: actions.present(state, trial.id, i, True, at), mine=True)
         self._at("step", i, seconds)
         await asyncio.sleep(seconds)
         await commit(lambda state, at: actions.present(state, trial.id, i, False, at), mine=True)
 
     async def _untouched(self, work: asyncio.Future) -> Any:
-        """The result of work that waits until no hand touches the rig; a hand that stays is asked to leave. Raises
-        `HandError` if it is still there `_LEAVES` s later."""
+        """The result of `work`, which waits until no hand touches the rig. While a hand stays, the stage is "let-go".
+        Raises what `work` raises, and `HandError` once the hand has been asked to leave for `_LEAVES` s."""
         wait = _HAND
         while not (await asyncio.wait([work], timeout=wait))[0]:
             touched, now = self.hub.rig.snapshot.contact, time.monotonic()
@@ -236,24 +245,26 @@ class Runner:
         return await work
 
     def _loading(self, trial: Trial, side: str | None) -> asyncio.Task:
-        """`_load` as a task in the background."""
+        """A background task of `_load`; if nobody awaits it, its exception is dropped."""
         task = asyncio.ensure_future(self._load(trial, side))
         task.add_done_callback(_retrieve_exception)
         return task
 
     async def _load(self, trial: Trial, side: str | None) -> None:
-        """Have the rig prepare a side; logged if that puts it in force."""
+        """Have the rig prepare a side ("a" or "b") of a trial, and log it if the rig then has it in force. Nothing for
+        None, or for a side in force already."""
         if side is None or self._in_force == (trial.id, trial.presentation, side):
             return
         self._in_force = None  # unknown until this one is
         showing = self._showing_of(trial, 0, side)
         loaded = await self.hub.rig.prepare(showing)
         if loaded is not None:
-            await self._in_log(trial, side, loaded)
+            await self._log_in_force(trial, side, loaded)
             self._in_force = (trial.id, trial.presentation, side)
 
-    async def _in_log(self, trial: Trial, side: str, loaded: Loaded) -> None:
-        """Log that a side is in force; the rendering presented may differ from the one requested."""
+    async def _log_in_force(self, trial: Trial, side: str, loaded: Loaded) -> None:
+        """Log that a side is in force, with the rig's facts, and record the delay. If what is presented differs from
+        what was requested, the proposals computed in advance are computed again."""
         self._note_times(loaded)
         await self.hub.commit(lambda state, at: actions.sent(state, trial.id, side, at, **loaded.facts), mine=True)
         now = self.hub.state.trial(trial.id)
@@ -262,11 +273,14 @@ class Runner:
             self._look_ahead()
 
     def _showing_of(self, trial: Trial, step: int, show: Any) -> Showing:
+        """The request to the rig for a step: `show` is "a", "b", "reference" or "neutral"; without values for the last
+        two."""
         material = self.hub.state.header.blocks[trial.block].material
         return Showing(trial.id, trial.presentation, step, show, trial.renderings.get(show), material)
 
     async def _missed(self, why: str) -> None:
-        """Void the trial of a step that was not presented, and wait for Begin."""
+        """Log that the last requested step was not presented, which voids its trial, unless that is refused; then Begin
+        must be pressed."""
         hub, showing = self.hub, self._showing
         assert showing is not None  # only a step can be missed
         with contextlib.suppress(RefusedError):
@@ -274,7 +288,8 @@ class Runner:
         hub.begun = False
 
     def _note_times(self, loaded: Loaded) -> None:
-        """Record the time from an answer to the next parameters in force, by part."""
+        """Append the times (s) from the last answer to this rendering in force, by part, to `hub.delays`, if it follows
+        an answer; then forget that answer."""
         clock, now = self.clock, time.perf_counter()
         if {"came", "chosen", "proposed"} <= set(clock):
             parts = {"total": now - clock["came"], "fsync": clock["fsync"], "chosen": clock["chosen"]}
@@ -282,7 +297,7 @@ class Runner:
         self.clock = {}
 
     async def _rig_ready(self) -> None:
-        """Wait while the rig is disconnected or in HOLD or ESTOP."""
+        """Wait until the rig is connected and not in HOLD or ESTOP; meanwhile the stage is "trouble"."""
         while True:
             seen = self.hub.rig.snapshot
             if seen.lost is None and seen.state not in ("HOLD", "ESTOP"):
@@ -296,15 +311,15 @@ class Runner:
                 await asyncio.wait_for(self._wake.wait(), _LATER)
 
     def _look_ahead(self) -> None:
-        """Compute the next proposal for each possible answer, in the thread that chooses; it stops at the answer, after
-        which that thread is needed."""
+        """Start to compute the next proposal for each possible answer, in the thread of the choices; it stops once
+        another presentation is due."""
         hub = self.hub
         state, key = hub.state, self.key()
         self._ahead = hub.compute.submit(hub.chooser.lookahead, state, lambda: self.key() == key)
 
 
 def _next_side(steps: Sequence[tuple[str, float]], i: int) -> str | None:
-    """The first rendering to be presented from step `i` on."""
+    """The first side, "a" or "b", among the steps (show, seconds) from index `i` on; None if there is none."""
     return next((show for show, _ in steps[i:] if show in ("a", "b")), None)
 
 
