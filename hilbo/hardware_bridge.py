@@ -131,7 +131,8 @@ class Renderer:
                 raise
 
     def close(self) -> None:
-        """Stop the device and close the line. Raises `DeviceError` if the stop could not be sent."""
+        """Stop the device, end the connection and a simulated device. Raises `DeviceError` if the stop could not be
+        sent."""
         try:
             if self._link.lost is None:
                 self._link.request(Stop())
@@ -158,7 +159,8 @@ class Renderer:
         return self._link
 
     def _begin(self) -> None:
-        """Open a connection: handshake, stop of a moving device, heartbeats, telemetry."""
+        """Open a connection: handshake, stop of a moving device, heartbeats, telemetry. Sets `device`, and adds to
+        `notes`."""
         self._link = self._connect()
         try:
             self.device = greet(self._link, self._damping, self._delay)
@@ -185,19 +187,18 @@ class Renderer:
         return put_in_force(self._link, self.device, messages, float(wait))
 
     def in_force(self) -> InForce | None:
-        """Parameter set in force; None if there is none."""
+        """Ask the device for the parameter set in force; None if there is none."""
         return in_force(self._link.request(GetSet(bank=0)))
 
     @property
     def delay(self) -> float:
-        """Longest time (s) from the sample of a position to its force, for which the device checks its sets."""
+        """Longest time (s) from the sample of a position to its force, for which the device checks its sets; asks the
+        device."""
         return self._link.request(GetLimits()).delay_us * 1e-6
 
     def home(self, position: SupportsFloat = 0.0) -> None:
-        """Set the current position (mm) of the handle of a device without an absolute encoder.
-
-        Raises `DeviceError` while it moves, `RefusalError` for a position outside of its stroke.
-        """
+        """Tell a device without an absolute encoder that its handle is now at `position` (mm); nothing moves. Raises
+        `DeviceError` while it moves, `RefusalError` for a position outside of its stroke."""
         place = {"stop": self._link.stops, "position_mm": float(position)}
         self._link.request(Home(boot_id=self.device.boot_id, **place))
 
@@ -227,7 +228,7 @@ class Renderer:
             self._link.pause(_NEAR)
 
     def stop(self) -> int:
-        """Ramp the force to zero, and return the device's count of stops, this one included."""
+        """Ramp the force to zero, and return the device's count of stops, including this one."""
         return self._link.request(Stop()).stops
 
     def estop(self) -> None:
@@ -244,24 +245,25 @@ class Renderer:
         retry_while_busy(self._link, self.device, clear, self._link.now() + _SINKS)
 
     def status(self) -> Status:
-        """State and counters of the device."""
+        """Ask the device for its state and counters."""
         return self._link.request(GetStatus())
 
     def state(self) -> State:
-        """State of the device."""
+        """Ask the device for its state."""
         return State(self.status().state)
 
     def condition(self) -> Condition:
-        """Homing, hardware stop, delay, and continuous force of the motor."""
+        """Ask the device for homing, hardware stop, delay, and continuous force of the motor."""
         return condition_of(self.status(), self._link.request(GetLimits()))
 
     def limits(self) -> dict[str, tuple[float, float]]:
-        """Ranges that the device accepts: lowest and highest K0, K1 (N/mm), B1 (N·s^α/mm) and alpha."""
+        """Ask the device for the ranges it accepts: lowest and highest K0, K1 (N/mm), B1 (N·s^α/mm) and alpha, by
+        name."""
         limits = self._link.request(GetLimits())
         return {n: (getattr(limits, f"{n}_low"), getattr(limits, f"{n}_high")) for n in ("K0", "K1", "B1", "alpha")}
 
     def echo(self, data: bytes) -> bytes:
-        """Send bytes to the device and return its echo."""
+        """Send bytes to the device and return the bytes that it sends back."""
         return self._link.request(Echo(data=data)).data
 
     def stream(self, divisor: int = 1, *, sensed: bool | None = None) -> int:
@@ -291,12 +293,10 @@ class Renderer:
         duration: SupportsFloat,
         stop: int | None = None,
     ) -> None:
-        """Let the device move by itself for `duration` s: see DRIVE in PROTOCOL.md.
+        """Let the device move by itself for `duration` s, with forces in N, positions in mm and times in s: see DRIVE
+        in PROTOCOL.md. `stop`: as for `start`. Does not wait for the end of the drive.
 
-        Force in N, position in mm, times in s.
-
-        `stop`: as for `start`. Raises `InputError` for another mode or shape, `DeviceError` for a device that cannot
-        move by itself.
+        Raises `InputError` for another mode or shape, `DeviceError` for a device that cannot move by itself.
         """
         if not self.can & Capability.DRIVE:
             raise DeviceError(
@@ -343,7 +343,7 @@ class Renderer:
         return joined([*pieces, buffer.take()])
 
     def _more(self) -> bool:
-        """Wait for telemetry for up to `_POLL` s; return whether any came."""
+        """Wait for telemetry for up to `_POLL` s (of simulated time half of that); return whether any came."""
         seen = self._buffer.counts()
         if self._link.ours:
             self._link.pause(_POLL / 2)
@@ -352,11 +352,12 @@ class Renderer:
         return self._buffer.counts() != seen
 
     def counts(self) -> Counts:
-        """Counts of samples received, dropped by the device, and missing."""
+        """Counts of telemetry samples since the connection: received, dropped by the device, missing, and unread."""
         return self._buffer.counts()
 
     def events(self) -> list[str]:
-        """Notices of the device since the last call, in words."""
+        """Remove and return the device's notices since the last call, each as a sentence with tick, state and
+        reason."""
         sentences = []
         with contextlib.suppress(IndexError):
             while True:
@@ -367,8 +368,9 @@ class Renderer:
     def reconnect(self, timeout: SupportsFloat = 5.0) -> bool:
         """Connect again after the line or the device was away; return True if the device has not restarted meanwhile.
 
-        The device is left stopped, and after a restart without a set: send the set again and start it when ready.
-        `timeout` in s. Raises `DeviceError` if a simulated device has ended.
+        The device is left stopped, and after a restart without a set. `timeout` (s): how long opening the line is
+        tried; then `InputError` is raised. Raises `DeviceError` if a simulated device has ended, or the device does not
+        answer.
         """
         before, give_up = self.device.boot_id, time.monotonic() + float(timeout)
         self._link.close()
@@ -385,7 +387,8 @@ class Renderer:
 
 
 def _connected(port, baud, patience, capture, simulator) -> Link:
-    """Open the port and connect; the timeout of an answer defaults to that of the kind of device."""
+    """Open the port (a name, or socket://HOST:PORT) and return a `Link` on it, in lockstep for such a `simulator`.
+    `patience`: timeout (s) of an answer, None for the default of this kind of device."""
     ticks = simulator.ticks if simulator is not None and simulator.lockstep else None
     if patience is None:
         patience = _LOCKSTEP if ticks else _SIMULATED if simulator else _ANSWER

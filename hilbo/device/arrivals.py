@@ -26,7 +26,8 @@ class Arrivals:
         self._helper: HelperHeart | None = None
 
     def read(self) -> bytes:
-        """Return the bytes that have arrived, after a short wait; empty if none. Raises OSError if the line is lost."""
+        """Return the bytes that have arrived, after a short wait; empty if there are none. Blocks between `hand_over`
+        and `resume`. Raises OSError if the line is lost."""
         with self._change:
             self._released = self._handing_over
             self._change.notify_all()
@@ -41,19 +42,21 @@ class Arrivals:
         return data or b""
 
     def hand_over(self) -> None:
-        """Pause reading; return once the reading thread no longer uses the port. `resume` must follow."""
+        """Pause `read`, and return once the reading thread no longer uses the port, or after `end`. `resume` must
+        follow."""
         with self._change:
             self._handing_over = True
             self._change.wait_for(lambda: self._released or self._over)
 
     def resume(self, helper: HelperHeart | None) -> None:
-        """Continue reading, from `helper`, or from the port if it is None."""
+        """Let `read` continue with the output of `helper`, until that helper ends; with None, from the same source as
+        before."""
         with self._change:
             self._helper, self._handing_over = helper or self._helper, False
             self._change.notify_all()
 
     def end(self) -> None:
-        """Mark the end of reading, so that no call waits for the reading thread any more."""
+        """Mark reading as ended, so that no call of `hand_over` or `read` waits any longer."""
         with self._change:
             self._over = True
             self._change.notify_all()

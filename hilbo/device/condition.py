@@ -25,7 +25,7 @@ class Condition(NamedTuple):
 
 
 def condition_of(status: Status, limits: Limits) -> Condition:
-    """Combine a STATUS and a LIMITS message into a `Condition`."""
+    """Build a `Condition` from a STATUS and a LIMITS message."""
     return Condition(
         bool(status.flags & DeviceFlag.HOMED),
         bool(status.flags & DeviceFlag.STOP_OPEN),

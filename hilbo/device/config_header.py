@@ -31,7 +31,11 @@ _TEMPLATE = Path(__file__).parent / "templates" / "hilbo_device_config.h"
 def header(
     device: HelloReply, limits: Limits, damping: float, delay_us: int, about_damping: str, about_delay: str
 ) -> str:
-    """Complete header for a damping in N·s/m and a delay in µs; `about_…` are comments on how these were measured."""
+    """Return the text of a complete header for a damping in N·s/m and a delay in µs; the other numbers are the device's
+    own.
+
+    `about_damping`, `about_delay`: comments on how these were measured. The damping is rounded down to binary32.
+    """
     fastest = device.velocity_limit_mm_per_s
     numbers = asdict(device) | asdict(limits)
     numbers |= {"damping": _below(damping), "plausible_step_mm": 2 * fastest / device.tick_rate_Hz}
@@ -43,7 +47,8 @@ def header(
 
 
 def with_measured(base: str, where: str, device: HelloReply, limits: Limits, damping: float, delay_us: int) -> str:
-    """Replace damping (N·s/m) and delay (µs) in the header `base`; `where` is its file name for errors.
+    """Return the text of the header `base` with damping (N·s/m) and delay (µs) replaced; `where` is its file name for
+    errors.
 
     Raises `InputError` if the header lacks one of the two, or has another value than the device reports, so that it
     belongs to another device.
@@ -71,5 +76,5 @@ def _below(value: float) -> float:
 
 
 def _c_float(value: float) -> str:
-    """C literal of the value rounded to binary32."""
+    """Format the value, rounded to binary32, as a C literal such as 0.95F."""
     return f"{np.format_float_positional(np.float32(value), trim='0')}F"

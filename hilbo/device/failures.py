@@ -1,4 +1,7 @@
-"""Errors of the communication with a device, and the sentence for each kind of failure."""
+"""Errors of the communication with a device, and the sentence for each kind of failure.
+
+The functions build the text (or the error) and raise nothing; `line` is the name of the port.
+"""
 
 from hilbo.device.heartbeat import GRACE
 from hilbo.device.messages import Nack
@@ -28,7 +31,7 @@ class DeviceError(RuntimeError):
 
     @property
     def in_contact(self) -> bool:
-        """Whether a motion was refused because the handle is in the material."""
+        """Whether the device refused a motion because the handle is in the material."""
         return self.nack is not None and self.nack.reason == NackReason.IN_CONTACT
 
 
@@ -41,18 +44,19 @@ class RefusalError(InputError):
 
 
 def refusal(nack: Nack, request: str) -> DeviceError | RefusalError:
-    """Error for a NACK of `request` (its name in PROTOCOL.md)."""
+    """Return the error for a NACK of `request` (its name in PROTOCOL.md): `RefusalError` if the numbers sent are the
+    cause, else `DeviceError`."""
     words = sentence(nack.reason, request, nack.ticks, nack.value, nack.limit)
     return (RefusalError if nack.reason in ABOUT_INPUT else DeviceError)(words, nack)
 
 
 def restarted(line: str) -> str:
-    """Message: the device has restarted since the host greeted it."""
+    """Sentence: the device has restarted since the handshake."""
     return f"{line}: the device has restarted; it is stopped and knows no set: connect again, then send the set."
 
 
 def fainted(line: str) -> str:
-    """Message: the heartbeats of this host have ended."""
+    """Sentence: the heartbeats of this host have ended, because it hung or the helper process was ended."""
     return (
         f"{line}: heartbeats have ended, because this program hung for {GRACE:g} s or their process was ended; the"
         " device lets go: connect again."
@@ -60,12 +64,13 @@ def fainted(line: str) -> str:
 
 
 def deserted(silent: str) -> str:
-    """Message: a request to a known device stayed unanswered; extends the sentence `silent`."""
+    """Sentence: the heartbeats have ended after a request stayed unanswered; `silent` is the sentence about the
+    request."""
     return f"{silent} Heartbeats have ended, so that the device lets go: connect again."
 
 
 def line_gone(line: str, error: OSError) -> str:
-    """Message: the port can no longer be read or written."""
+    """Sentence: the port can no longer be read or written because of `error`."""
     return (
         f"{line}: the line to the device is gone ({error}); it stops by itself, check power and cable, then connect"
         " again."
@@ -73,7 +78,7 @@ def line_gone(line: str, error: OSError) -> str:
 
 
 def not_taken(line: str, error: Exception) -> str:
-    """Message: the receiver of incoming data failed."""
+    """Sentence: the connection has ended because `error` was raised while received data were processed."""
     return (
         f"{line}: what the device says cannot be taken ({error}); heartbeats have ended and the device stops by itself;"
         " remove the cause, then connect again."
@@ -81,13 +86,15 @@ def not_taken(line: str, error: Exception) -> str:
 
 
 def urgent(lost: str, request: str, written: bool) -> str:
-    """Message: STOP or ESTOP on a lost line; `lost` is why it is lost, `written` whether the line took the bytes."""
+    """Sentence: STOP or ESTOP (`request`) on a lost line. `lost`: sentence that says why the line is lost; `written`:
+    whether the bytes could still be written."""
     how = "was written all the same; no answer can come" if written else "cannot be written"
     return f"{lost} {request} {how}: see that the device rests."
 
 
 def silent(line: str, request: str, tries: int, *, received: bool, foreign: bool) -> str:
-    """Message: no answer came. `received`: bytes came back; `foreign`: frames came back, but not from a device."""
+    """Sentence: `request` was not answered in `tries` tries. `received`: any bytes came back; `foreign`: they came from
+    no device with this protocol."""
     if not received:
         why = "nothing at all comes back; check power, cable and port"
     elif foreign:

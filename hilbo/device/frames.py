@@ -28,9 +28,10 @@ class Frame(NamedTuple):
 
 
 def closed(frame: Frame) -> bytes:
-    """Encode a frame to bytes, including its 0x00. Raises `WireError` for a payload that is too long.
+    """Encode a frame as bytes for the line: body, CRC-32, COBS and the final 0x00.
 
-    Bodies are shorter than 254 bytes, so that COBS needs no long runs.
+    Raises `WireError` for a payload of more than 64 bytes. Bodies are shorter than 254 bytes, so that COBS needs no
+    long runs.
     """
     if len(frame.payload) > PAYLOAD:
         raise WireError(f"a payload of {len(frame.payload)} bytes, more than {PAYLOAD}")
@@ -40,7 +41,10 @@ def closed(frame: Frame) -> bytes:
 
 
 def opened(frame: bytes) -> Frame:
-    """Decode a frame given without its 0x00. Raises `WireError` for a damaged one."""
+    """Decode the bytes of a frame, given without its 0x00, and check its CRC-32.
+
+    Raises `WireError` for a damaged frame: too long or short, invalid COBS, or a wrong CRC.
+    """
     if len(frame) > LONGEST:
         raise WireError(f"{len(frame)} bytes without 0x00, more than {LONGEST}")
     body = _unstuffed(frame)
@@ -62,7 +66,8 @@ class Receiver:
         self._buffer = b""
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that these bytes complete."""
+        """Add received bytes and return the intact frames that they complete. Damaged frames are left out and counted
+        in `dropped`; the bytes of an incomplete frame are kept for the next call."""
         *complete, rest = (self._buffer + data).split(b"\0")
         self._buffer = rest[: LONGEST + 1]  # one byte too many marks the frame as too long
         frames = []
@@ -75,7 +80,8 @@ class Receiver:
 
 
 def _unstuffed(frame: bytes) -> bytes:
-    """Remove the COBS encoding of a frame given without its 0x00. Raises `WireError` for invalid COBS."""
+    """Remove the COBS encoding from the bytes of a frame, given without its 0x00. Raises `WireError` for invalid
+    COBS."""
     runs, position = [], 0
     while position < len(frame):
         end = position + frame[position]

@@ -23,10 +23,11 @@ _BEATS = 4  # heartbeats that must fit into the device's watchdog, since each ca
 
 
 def greet(link: Link, damping: SupportsFloat | None, delay: SupportsFloat | None = None) -> HelloReply:
-    """Send HELLO, repeatedly while a board starts up, and check the reply.
+    """Send HELLO, repeatedly for up to 3 s while a board starts up, check the reply and return it.
 
-    Raises `InputError` for a device with less damping than `damping` (N·s/m) or more delay than `delay` (s),
-    `DeviceError` for one with another protocol version or too short a watchdog.
+    `damping` (N·s/m) and `delay` (s) are the values that a study assumes; None is not checked. Raises `InputError` for
+    one that is negative or not finite, and for a device with less damping or more delay; `DeviceError` if there is no
+    answer, and for a device with another protocol version or too short a watchdog.
     """
     give_up = time.monotonic() + _BOOT
     while True:
@@ -60,7 +61,8 @@ def greet(link: Link, damping: SupportsFloat | None, delay: SupportsFloat | None
 
 
 def _check_delay(link: Link, delay: float) -> None:
-    """Raise `InputError` if the device's delay exceeds the `delay` (s) that the study assumes.
+    """Ask the device for its delay. Raises `InputError` if it exceeds the `delay` (s) that the study assumes, or if
+    that is negative or not finite.
 
     The device refuses sets that are not passive at its own delay, so a study that assumes less would propose such sets.
     """
@@ -75,7 +77,11 @@ def _check_delay(link: Link, delay: float) -> None:
 
 
 def take_over(link: Link, device: HelloReply) -> list[str]:
-    """Stop the device if it still moves, and begin the heartbeats. Returns notes to report."""
+    """Stop the device if it still moves, reset `link.restarted` and start the heartbeats.
+
+    Returns sentences for the user: that the device was stopped, or that it is in HOLD or ESTOP. Raises `DeviceError` if
+    it does not stop within 2 s.
+    """
     notes = []
     status = link.request(GetStatus())
     if status.state in (State.RUNNING, State.DRIVING, State.STOPPING):
@@ -96,7 +102,7 @@ def take_over(link: Link, device: HelloReply) -> list[str]:
 
 
 def shortest(value: float) -> str:
-    """Shortest decimal that rounds to the same binary32 as the value."""
+    """Format a value as the shortest decimal that rounds to the same binary32 number."""
     import numpy as np  # slow to import, and not needed by all commands
 
     return np.format_float_positional(np.float32(value), trim="-")

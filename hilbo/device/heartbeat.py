@@ -57,13 +57,13 @@ class Heard:
         self.tick, self._receiver = tick, Receiver()
 
     def feed(self, data: bytes) -> None:
-        """Process bytes received on the line."""
+        """Process bytes received on the line: store the newest device tick in their complete frames."""
         for frame in self._receiver.feed(data):
             if frame.type in WITH_TICK and len(frame.payload) >= 4:
                 self.newer(int.from_bytes(frame.payload[:4], "little"))
 
     def newer(self, tick: int) -> None:
-        """Store a received tick if it is newer, modulo 2^32."""
+        """Store a received tick if it is newer than the stored one, modulo 2^32."""
         if (tick - self.tick) % 2**32 < 2**31:
             self.tick = tick
 
@@ -77,13 +77,13 @@ class ThreadHeart:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the thread; return after the last beat."""
+        """Stop the thread, and return after its last beat (at once if called from that thread)."""
         self._closing.set()
         if self._thread is not threading.current_thread():
             self._thread.join()
 
     def _run(self) -> None:
-        """Call `beat` periodically until closed."""
+        """Call `beat` every `BEAT` seconds until closed, or until it raises OSError."""
         with contextlib.suppress(OSError):
             while not self._closing.is_set():
                 self._beat()
@@ -111,10 +111,8 @@ class HelperHeart:
         self._signs = ThreadHeart(self._sign)
 
     def read(self, timeout: float) -> bytes | None:
-        """Bytes that arrived on the line within `timeout` s.
-
-        None once the helper has ended and all of its output is read.
-        """
+        """Return the bytes that arrived on the line within `timeout` s; empty if there are none, None once the helper
+        has ended and all of its output is read."""
         pipe = self.process.stdout
         assert pipe is not None
         if self._drained.is_set():
@@ -136,9 +134,10 @@ class HelperHeart:
             self.process.stdin.write(_QUIET if quiet else _LOUD)
 
     def close(self, reader: threading.Thread) -> None:
-        """End the helper.
+        """End the helper process.
 
-        Return after its last heartbeat, and once the thread `reader`, which calls `read`, has read the rest.
+        Returns after its last heartbeat, and once the thread `reader`, which calls `read`, has read the rest or ended,
+        for which it waits up to `GRACE`.
         """
         self._signs.close()
         assert self.process.stdin is not None
@@ -154,7 +153,7 @@ class HelperHeart:
     def _sign(self) -> None:
         """Write a sign of life to the helper.
 
-        Raises OSError if it has ended, after calling `ended` unless the line is lost.
+        If the helper has ended, call `ended`, except where the line is lost, and raise OSError.
         """
         assert self.process.stdin is not None
         try:
@@ -165,7 +164,7 @@ class HelperHeart:
             raise OSError("the helper has ended") from None
 
     def _reap(self) -> None:
-        """Close the pipes and wait for the process to end."""
+        """Close the pipes to the helper and wait for its process to end."""
         for pipe in (self.process.stdin, self.process.stdout):
             with contextlib.suppress(OSError):
                 pipe.close()  # type: ignore[union-attr]
@@ -175,18 +174,20 @@ class HelperHeart:
 def heart_for(
     port: Any, boot_id: int, tick: int, beat: Callable[[], Any], ended: Callable[[], Any]
 ) -> HelperHeart | ThreadHeart:
-    """Start the heartbeats of a port: a helper process, or a thread that calls `beat` if the line cannot be shared.
+    """Start and return the heartbeats of a port: a helper process, or a thread that calls `beat` if the line cannot be
+    shared.
 
-    `ended` is called if the helper ends by itself. Raises OSError if it cannot be started.
+    `ended` is called if the helper ends by itself. Raises OSError if the helper cannot be started.
     """
     shared = os.name == "posix" and hasattr(port, "fileno") and sys.executable and not hasattr(sys, "frozen")
     return HelperHeart(port.fileno(), boot_id, tick, ended) if shared else ThreadHeart(beat)
 
 
 def keep_beating(line: int, boot_id: int, tick: int, signs: int, out: int, grace: float) -> None:
-    """Main loop of the helper: send heartbeats to `line` and copy its input to `out`.
+    """Main loop of the helper process: send heartbeats to `line` and copy what arrives there to `out`.
 
-    Returns when the pipe `signs` ends or has been silent for `grace` s. Raises OSError if the line is lost.
+    `line`, `signs`, `out` are file descriptors, `tick` is the last tick received. Returns when the pipe `signs` ends or
+    has been silent for `grace` s, or the parent process has ended. Raises OSError if the line is lost.
     """
     for number in (line, signs, out):
         os.set_blocking(number, False)
@@ -217,14 +218,14 @@ def keep_beating(line: int, boot_id: int, tick: int, signs: int, out: int, grace
 
 
 def _read_signs(signs: int) -> bytes:
-    """Signs from the host that are waiting in its pipe; empty at its end."""
+    """Read the waiting signs of life from the pipe; empty at its end, one sign if nothing is waiting."""
     with contextlib.suppress(BlockingIOError):
         return os.read(signs, 4096)
     return _ALIVE
 
 
 def _read_line(line: int) -> bytes:
-    """Bytes waiting on the line. Raises OSError if it has ended."""
+    """Read the bytes that are waiting on the line; empty if there are none. Raises OSError if the line has ended."""
     try:
         data = os.read(line, 65536)
     except BlockingIOError:
@@ -235,10 +236,8 @@ def _read_line(line: int) -> bytes:
 
 
 def _pass_on(out: int, waiting: bytes, timeout: float = 0.0) -> bytes:
-    """Write the bytes `waiting` to `out`.
-
-    Return those that it did not accept, waiting up to `timeout` s between parts.
-    """
+    """Write the bytes `waiting` to `out`, waiting up to `timeout` s when it is full, and return those that are still to
+    be written; empty if the host has closed the pipe."""
     while waiting:
         try:
             waiting = waiting[os.write(out, waiting) :]
@@ -251,9 +250,10 @@ def _pass_on(out: int, waiting: bytes, timeout: float = 0.0) -> bytes:
 
 
 def _write(line: int, frame: bytes) -> None:
-    """Write a heartbeat frame; skip it if the line is full.
+    """Write a heartbeat frame to the line; skip it if the line is full.
 
-    A frame partly written is completed if possible within a beat.
+    The rest of a frame that is partly written is written if the line takes it within a beat. Raises OSError if the line
+    is lost.
     """
     rest = frame
     while rest:
@@ -265,7 +265,8 @@ def _write(line: int, frame: bytes) -> None:
 
 
 def _main() -> None:
-    """Entry point of the helper process."""
+    """Entry point of the helper process, with the arguments line, boot_id, tick and grace; ends with exit code 3 if the
+    line is lost."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the host handles Ctrl-C: it stops the device and ends the helper
     line, boot_id, tick, grace = int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
     os.write(1, b"\n")

@@ -114,11 +114,9 @@ class Link:
         return self._receiver.dropped
 
     def request(self, message: Message) -> Message:
-        """Send a request and return its answer.
-
-        Raises `RefusalError` for refused numbers, `InputError` for numbers that do not fit the message, else
-        `DeviceError`.
-        """
+        """Send a request, wait for its answer and return it; one request at a time. ESTOP is also written at once,
+        before others. A START or DRIVE that fails is followed by STOP. Raises `RefusalError` for refused numbers,
+        `InputError` for numbers that do not fit the message, else `DeviceError`."""
         if isinstance(message, Estop) and not self.lost:
             self._hush(True)  # if every ESTOP is lost, the device's watchdog ends its force
             self.shout(message)
@@ -148,7 +146,8 @@ class Link:
         return answer
 
     def _unanswered(self, kind: type) -> str:
-        """Error message for a request without an answer; ends the heartbeats of a known device."""
+        """Return the sentence for an unanswered request; for a known device, also end the heartbeats and set
+        `faint`."""
         foreign = bool(self._receiver.dropped) and self.boot_id is None
         why = failures.silent(self.name, name_of(kind), self.tries, received=self.received > 0, foreign=foreign)
         if self.boot_id is None:
@@ -158,10 +157,8 @@ class Link:
         return failures.deserted(why)
 
     def _ask(self, frame, expected) -> Message:
-        """Send a frame and wait for the `expected` answer (sequence number, request code, class).
-
-        None after all tries.
-        """
+        """Send a frame up to `tries` times and return the `expected` answer (sequence number, request code, class), or
+        None if none came. Raises `DeviceError` if the line is lost."""
         with self._news:
             self._expected, self._answer = expected, None
         for attempt in range(self.tries):
@@ -181,12 +178,9 @@ class Link:
         return None
 
     def shout(self, message: Message) -> bool:
-        """Write STOP or ESTOP to the line at once, bypassing all locks, even if the line is lost.
-
-        Return whether it was written.
-
-        The leading 0x00 ends any frame another thread has begun; the device accepts both messages in every state.
-        """
+        """Write STOP or ESTOP to the line at once, bypassing all locks, even if the line is lost; return whether it was
+        written. The leading 0x00 ends any frame another thread has begun; the device accepts both messages in every
+        state."""
         try:
             self._port.write(b"\0" + protocol.encode(message, 0))
         except OSError:
@@ -194,7 +188,8 @@ class Link:
         return True
 
     def write(self, data: bytes) -> None:
-        """Write complete frames to the line. Raises `DeviceError` if the line is lost."""
+        """Write the bytes of complete frames to the line. Raises `DeviceError` if the line is lost, or is lost by this
+        write."""
         try:
             with self._writing:  # taken by `close` too, so that no port is closed during a write
                 if self.lost:
@@ -204,10 +199,9 @@ class Link:
             raise DeviceError(self._lose(error)) from error
 
     def beat(self, boot_id: int | None) -> None:
-        """Start heartbeats for this start of the device; with None stop them.
-
-        Raises `DeviceError` if the helper does not start.
-        """
+        """Stop the heartbeats, and start them for this start of the device, unless `boot_id` is None. With simulated
+        time one is sent now and the others by `pause`. Raises `DeviceError` if the helper does not start, or the line
+        is lost."""
         self.boot_id = boot_id
         self._end_beats()
         if boot_id is None:
@@ -228,7 +222,7 @@ class Link:
             self._end_beats()
 
     def _end_beats(self) -> None:
-        """Stop the heartbeats; return after the last one."""
+        """Stop the heartbeats, if any; return after the last one."""
         with self._news:
             heart, self._heart = self._heart, None
         if isinstance(heart, HelperHeart):
@@ -252,7 +246,7 @@ class Link:
             self.write(protocol.encode(Heartbeat(boot_id=self.boot_id, tick=self.heard.tick), 0))
 
     def _hush(self, quiet: bool) -> None:
-        """Pause the heartbeats at once, or resume them."""
+        """Pause the heartbeats at once (`quiet`), or resume them."""
         with self._news:
             self._quiet, heart = quiet, self._heart
         if isinstance(heart, HelperHeart):
@@ -268,10 +262,8 @@ class Link:
         return self._passed / 1000 if self.ours else time.monotonic()
 
     def pause(self, seconds: float) -> None:
-        """Wait for `seconds`.
-
-        Advance a device with simulated time, with heartbeats, until everything it sent has been read.
-        """
+        """Wait for `seconds`. With simulated time: advance the device by as much, at least 1 ms, with heartbeats, and
+        read all that it sent."""
         if self._ticks is None:
             time.sleep(seconds)
             return
@@ -284,7 +276,8 @@ class Link:
             self.request(GetStatus())
 
     def close(self) -> None:
-        """End the heartbeats and the reading thread, and close the port."""
+        """Mark the connection as lost, end heartbeats and reading thread, and close the port; the device is not stopped
+        first."""
         self._closing.set()
         with self._news:
             self.lost = self.lost or f"{self.name}: the connection has been closed; open it again."
@@ -304,11 +297,12 @@ class Link:
             raise OSError(str(error)) from error
 
     def _fainted(self) -> None:
-        """Record that the helper process has ended."""
+        """Record in `faint` that the helper process has ended, unless a reason is recorded already."""
         self.faint = self.faint or failures.fainted(self.name)
 
     def _read(self) -> None:
-        """Loop of the reading thread, until the connection is closed or lost."""
+        """Loop of the reading thread: receive until the connection is closed, the line is lost, or a receiver
+        raises."""
         while not self._closing.is_set():
             try:
                 data = self._arrivals.read()
@@ -322,7 +316,7 @@ class Link:
                 return
 
     def _heard(self, data: bytes) -> None:
-        """Process received bytes: count, capture, and handle each complete frame."""
+        """Process received bytes: count them, pass them to `capture`, and handle each complete frame."""
         self.received += len(data)
         if self._capture is not None and data:
             self._capture(data)
@@ -330,7 +324,8 @@ class Link:
             self._take(frame)
 
     def _take(self, frame) -> None:
-        """Decode a frame and dispatch it to the telemetry receiver, the notices or the waiting request."""
+        """Decode a frame and pass its message to the telemetry receiver, the notices or the waiting request; a frame
+        that is no message is counted in `strange`."""
         try:
             message = protocol.decode(frame)
         except WireError:
@@ -348,7 +343,7 @@ class Link:
             self._give(frame.seq, message)
 
     def _learn(self, message: Message) -> None:
-        """Update restart flag, newest tick and count of stops from any message."""
+        """Update `restarted`, the newest tick and `stops` from a received message."""
         if isinstance(message, HelloReply):
             self.heard.tick = message.tick
         elif isinstance(message, Notice | Status | Pulse) and self.boot_id not in (None, message.boot_id):
@@ -361,7 +356,7 @@ class Link:
             self.stops = message.ticks
 
     def _give(self, seq, message) -> None:
-        """Deliver an answer to the waiting request; count and drop it if it does not match."""
+        """Deliver an answer to the waiting request; one that does not match is dropped and counted in `stray`."""
         with self._news:
             if self._expected is not None and self._answer is None and _fits(seq, message, self._expected):
                 self._answer = message
@@ -370,11 +365,11 @@ class Link:
                 self.stray += 1
 
     def _lose(self, error: OSError) -> str:
-        """Mark the line as lost after an OSError; return the reason."""
+        """Mark the line as lost because of `error` and end the heartbeats; return the first reason recorded."""
         return self._end(failures.line_gone(self.name, error))
 
     def _end(self, why: str) -> str:
-        """Mark the connection as lost and end the heartbeats; return the first reason given."""
+        """Mark the connection as lost for the reason `why` and end the heartbeats; return the first reason recorded."""
         with self._news:
             self.lost = self.lost or why
             self._news.notify_all()
@@ -384,7 +379,7 @@ class Link:
         return why
 
     def _refusal(self, nack: Nack, request: str) -> Exception:
-        """Error for a NACK; sets `restarted` if the NACK shows a restarted device."""
+        """Return the error for a NACK; set `restarted` if the NACK shows that the device has restarted."""
         if nack.reason in (NackReason.BOOT_ID, NackReason.NO_HELLO) and request != "HELLO":
             self.restarted = True
             return DeviceError(failures.restarted(self.name), nack)
@@ -392,7 +387,7 @@ class Link:
 
 
 def _fits(seq: int, message: Message, expected: tuple[int, int, type]) -> bool:
-    """Whether a message answers the waiting request `expected`."""
+    """Whether a message answers the waiting request `expected` (sequence number, request code, class of the answer)."""
     wanted, request, kind = expected
     acknowledges = isinstance(message, Ack | Nack) and message.request == request
     return seq == wanted and (acknowledges or (type(message) is kind and kind is not Ack))

@@ -346,10 +346,10 @@ _TYPES = {kind: code for code, kind in MESSAGES.items()}
 
 
 def code_of(kind: type) -> int:
-    """Type byte of a message class."""
+    """Type byte of a message class on the wire."""
     return _TYPES[kind]
 
 
 def name_of(kind: type) -> str:
-    """Name of a message class in PROTOCOL.md: SET_PARAMS for SetParams."""
+    """Name of a message class in PROTOCOL.md, such as SET_PARAMS for SetParams."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", kind.__name__).upper()

@@ -47,9 +47,11 @@ class ParameterSet:
     force_limit: SupportsFloat | None = None
 
     def messages(self, device: HelloReply) -> list[SetParams | SetStates]:
-        """SET_PARAMS message for a device, followed for full memory (which loads JAX) by SET_STATES; not yet numbered.
+        """Return the messages that send this set to a device, not yet numbered (`set_id` 0): SET_PARAMS, and for full
+        memory, which loads JAX, SET_STATES.
 
-        Raises `InputError` for values that are no numbers or cannot be sent.
+        Raises `InputError` for values that are no finite numbers or do not fit a message, another memory than "short"
+        or "full", and a T that is not the device's tick.
         """
         rate = device.tick_rate_Hz
         if not abs(rate * _number("T", self.T) - 1) < 1e-9:
@@ -93,7 +95,7 @@ class InForce(NamedTuple):
 
 
 def _number(name: str, value: SupportsFloat) -> float:
-    """Convert a value to float. Raises `InputError` if that fails."""
+    """Convert a value to float. Raises `InputError`, in which `name` is the name of the value, if that fails."""
     try:
         return float(value)
     except (TypeError, ValueError):
@@ -101,12 +103,12 @@ def _number(name: str, value: SupportsFloat) -> float:
 
 
 def crc_of(messages: Sequence[SetParams | SetStates]) -> int:
-    """CRC-32 that identifies a set on device and host."""
+    """CRC-32 over the payloads of a set's messages, by which device and host identify the set."""
     return zlib.crc32(b"".join(payload_of(message) for message in messages))
 
 
 def in_force(reply: Set) -> InForce | None:
-    """Parameter set of a SET message; None if the device has none."""
+    """Convert a SET message to the parameter set in it; None if the device has none."""
     if not reply.flags & 1:
         return None
     numbers = {name: getattr(reply, wire) for name, wire in _WIRE_NAMES.items()}
@@ -115,7 +117,8 @@ def in_force(reply: Set) -> InForce | None:
 
 
 def differences(sent: Sequence[SetParams | SetStates], reply: Set) -> list[str]:
-    """Names of the fields in which the device's set differs, bit for bit, from the one that was sent."""
+    """Names of the fields in which the device's set differs, bit for bit, from the messages `sent`; empty if none
+    differs, ["no set"] if the device has no set."""
     if not reply.flags & 1:
         return ["no set"]
     names = ("set_id", "memory", *_WIRE_NAMES.values())
@@ -124,12 +127,15 @@ def differences(sent: Sequence[SetParams | SetStates], reply: Set) -> list[str]:
 
 
 def _bits(value: float | int) -> bytes | int:
-    """Value for comparison: an integer itself, a float as its binary32 bytes."""
+    """Value for a comparison bit for bit: an integer unchanged, a float as its binary32 bytes."""
     return struct.pack("<f", value) if isinstance(value, float) else value
 
 
 def _states(alpha: float, count: int) -> list[SetStates]:
-    """The exponentials of full memory, as many to a message as fit."""
+    """Return the SET_STATES messages with the `count` exponentials of full memory for this alpha, seven to a message.
+
+    Loads JAX. Raises `InputError` for a count that is not in `STATES`, or an alpha outside of (0, 1).
+    """
     if count not in STATES:
         raise InputError(f"states is {count}; it must be one of {', '.join(map(str, STATES))}.")
     if not 0 < alpha < 1:

@@ -94,7 +94,8 @@ class SocketPort:
 
 
 def _closed() -> OSError:
-    """OSError in place of pyserial's TypeError for a port closed by another thread during a read or write."""
+    """Return the OSError that replaces pyserial's TypeError for a port closed by another thread during a read or
+    write."""
     return OSError(errno.EBADF, "the port is closed")
 
 
@@ -103,12 +104,16 @@ Port = SerialPort | SocketPort
 
 
 def open_port(where: str, baud: int = BAUD) -> Port:
-    """Open a serial port by name, or socket://host:port. Raises `InputError` if it cannot be opened."""
+    """Open `where`: "socket://HOST:PORT" as a TCP connection (`baud` is ignored), all else as the name of a serial
+    port.
+
+    Raises `InputError` if it cannot be opened.
+    """
     return _connected(where) if where.startswith("socket://") else SerialPort(where, baud)
 
 
 def list_ports() -> list[PortInfo]:
-    """List the serial ports of this computer. Raises `InputError` without pyserial."""
+    """Return the serial ports of this computer, sorted by name. Raises `InputError` if pyserial is not installed."""
     try:
         from serial.tools.list_ports import comports
     except ImportError as error:
@@ -117,7 +122,8 @@ def list_ports() -> list[PortInfo]:
 
 
 def _connected(where):
-    """Connect to socket://host:port. Raises `InputError` for a bad address or a failed connection."""
+    """Connect to `where`, socket://HOST:PORT, within 3 s. Raises `InputError` for a bad address or a failed
+    connection."""
     host, separator, number = where.removeprefix("socket://").rpartition(":")
     if not (separator and host and number.isdigit()):
         raise InputError(f'"{where}" is no address; write it like socket://192.168.0.7:5000.')
@@ -131,7 +137,7 @@ def _connected(where):
 
 
 def _opened(name, baud):
-    """Open a pyserial port exclusively. Raises `InputError` if it cannot be opened."""
+    """Open a serial port exclusively by pyserial, and return its object. Raises `InputError` if it cannot be opened."""
     try:
         import serial
     except ImportError as error:
@@ -144,7 +150,7 @@ def _opened(name, baud):
 
 
 def _why_not(name, baud, error) -> str:
-    """Error message for a serial port that cannot be opened."""
+    """Sentence for a serial port that cannot be opened because of `error`: the cause and what to do."""
     number = getattr(error, "errno", None)
     if number in _BUSY or "exclusively lock" in str(error):
         return f"{name}: another program uses this port; close it, or choose another port."

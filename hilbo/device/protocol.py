@@ -45,13 +45,13 @@ class _Layout(NamedTuple):
 
 
 def _wire(kind: type) -> dict[str, str]:
-    """Field name -> its type in the schema, from the annotations of a message class."""
+    """Field name of a message class -> its wire type, such as "u16" or "n*(byte:u8)", read from the annotations."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: get_args(hints[field.name])[1] for field in fields(kind)}
 
 
 def _layout(kind: type) -> _Layout:
-    """Binary layout of a message class, from its annotations."""
+    """Build the `_Layout` of a message class from its annotations."""
     wire = _wire(kind)
     names = tuple(name for name, word in wire.items() if word in _CODES)
     tail = next((name for name in wire if name not in names), None)
@@ -65,7 +65,8 @@ _LAYOUTS = {kind: _layout(kind) for kind in MESSAGES.values()}
 
 
 def schema_text() -> str:
-    """Schema block of PROTOCOL.md, generated from the message classes."""
+    """Return the schema block of PROTOCOL.md, generated from the message classes: the version, then a line for each
+    message."""
     lines = [f"version {VERSION}"]
     for code, kind in MESSAGES.items():
         words = [word if word.startswith("n*") else f"{name}:{word}" for name, word in _wire(kind).items()]
@@ -74,9 +75,9 @@ def schema_text() -> str:
 
 
 def payload_of(message: Message) -> bytes:
-    """Pack the payload of a message.
+    """Pack the fields of a message to the bytes of its payload, without a frame around them.
 
-    Raises `WireError` for a number that does not fit its field, or too long a payload.
+    Raises `WireError` for a number that does not fit its field, or a payload of more than 64 bytes.
     """
     layout = _LAYOUTS[type(message)]
     try:
@@ -91,7 +92,8 @@ def payload_of(message: Message) -> bytes:
 
 
 def _rows(layout, rows) -> bytes:
-    """Pack the items of a message's repeated field."""
+    """Pack the items `rows` of a message's repeated field. Bytes are returned unchanged; otherwise each item is a
+    tuple, packed without its last value if that is None."""
     if isinstance(rows, bytes):
         return rows
     return b"".join(
@@ -102,7 +104,7 @@ def _rows(layout, rows) -> bytes:
 def decode(frame: Frame) -> Message:
     """Unpack the message in a frame.
 
-    Raises `WireError` for an unknown type, a wrong length, or a reserved field not 0.
+    Raises `WireError` for an unknown type, a wrong length, or a reserved field that is not 0.
     """
     if frame.type not in MESSAGES:
         raise WireError(f"type {frame.type:#04x} is not of this protocol")
@@ -120,7 +122,11 @@ def decode(frame: Frame) -> Message:
 
 
 def _unpack_rows(kind, layout, values, rest):
-    """Unpack the items of a message's repeated field. Raises `WireError` for an incomplete item."""
+    """Unpack the bytes `rest` of the repeated field of a message class `kind`, given its other fields `values`.
+
+    Returns the bytes unchanged for an echo, else a tuple of `Exponential` (SET_STATES) or `Sample` (TELEMETRY). Raises
+    `WireError` for an incomplete item, or another number of exponentials than `values` has in `count`.
+    """
     if kind in (Echo, EchoReply):
         return rest
     wide = kind is Telemetry and values["fields"] & 1
@@ -132,12 +138,16 @@ def _unpack_rows(kind, layout, values, rest):
 
 
 def encode(message: Message, seq: int) -> bytes:
-    """Encode a message to the bytes of a frame, including its 0x00."""
+    """Encode a message with sequence number `seq` as the bytes of a frame, including the final 0x00.
+
+    Raises `WireError` as `payload_of` does.
+    """
     return closed(Frame(code_of(type(message)), seq, payload_of(message)))
 
 
 def frames_in(capture: bytes) -> Iterator[tuple[int, Message | WireError, Frame | None]]:
-    """Yield for each frame in captured bytes: its offset, its message or the error, and the frame (None if damaged)."""
+    """Split captured bytes into frames and yield for each: its offset in bytes, the message or the `WireError`, and the
+    `Frame` (None if it is damaged)."""
     offset = 0
     for raw in capture.split(b"\0"):
         frame = None

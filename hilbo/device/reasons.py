@@ -206,17 +206,20 @@ _WAY_OUT = {
 
 
 def meaning(names: type[IntEnum], number: int) -> str:
-    """Name of a number in an enumeration; an unknown number as text."""
+    """Name of the member of the enumeration `names` with this number; for an unknown number the enumeration and the
+    number, such as "state 9"."""
     return names(number).name if number in names._value2member_map_ else f"{names.__name__.lower()} {number}"
 
 
 def held_because(reason: int) -> str:
-    """Text for the reason why a device is in HOLD or changed its state."""
+    """Clause for a `HoldReason` number: why a device is in HOLD or changed its state; "of reason N" for an unknown
+    number."""
     return _HOLD[HoldReason(reason)] if reason in HoldReason._value2member_map_ else f"of reason {reason}"
 
 
 def sentence(reason: int, request: str, ticks: int, value: float, limit: float) -> str:
-    """Explain a NACK of `request` (its name in PROTOCOL.md) in words."""
+    """Sentence that explains a NACK: its `reason` (`NackReason`), the name of the `request` in PROTOCOL.md, and the
+    numbers that the NACK carries. A reason that is unknown is given by its number."""
     if reason not in NackReason._value2member_map_:
         return f"The device refuses {request} for reason {reason}, which this hilbo does not know; install a newer one."
     state = int(value) if reason == NackReason.STATE and value == value else 0

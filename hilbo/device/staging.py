@@ -16,10 +16,11 @@ _LONGEST_PAUSE = 0.1  # s between two tries
 
 
 def put_in_force(link: Link, device: HelloReply, wanted: Sequence[SetParams | SetStates], wait: float) -> InForce:
-    """Put the set `wanted` in force and return it as the device reports it, checked bit for bit.
+    """Put a parameter set in force, and return it as the device reports it, compared bit for bit.
 
-    `wanted`: messages of a `ParameterSet`, numbered here. A set that is already in force is not sent again. `wait` (s):
-    timeout for the device to fill the set's history.
+    `wanted`: messages of a `ParameterSet`; they get their number (`set_id`) here. A set that is already in force is not
+    sent again. `wait` (s): timeout for the device to fill the set's history. Raises `RefusalError` if the device
+    refuses the set, `DeviceError` after the timeout, or if the device reports another set.
     """
     status: Status = link.request(GetStatus())
     messages = [replace(message, set_id=status.active_id) for message in wanted]
@@ -34,7 +35,8 @@ def put_in_force(link: Link, device: HelloReply, wanted: Sequence[SetParams | Se
 
 
 def _stage(link: Link, device: HelloReply, messages: Sequence[SetParams | SetStates], give_up: float) -> None:
-    """Send all messages of a set, and check the CRC in each answer."""
+    """Send all messages of a set, waiting while the device is busy. Raises `DeviceError` if the CRC in an answer shows
+    that the device received something else."""
     for count, message in enumerate(messages, 1):
         answer = retry_while_busy(link, device, message, give_up)
         if answer.crc != crc_of(messages[:count]):
@@ -42,9 +44,10 @@ def _stage(link: Link, device: HelloReply, messages: Sequence[SetParams | SetSta
 
 
 def retry_while_busy(link: Link, device: HelloReply, message: Message, give_up: float) -> Ack:
-    """Repeat a request while the device answers NOT_READY or BUSY; return its answer.
+    """Send a request, repeat it after a pause while the device answers NOT_READY or BUSY, and return the final answer.
 
-    `give_up`: time of the link's clock after which the NACK is raised as an error.
+    `give_up`: time of the link's clock (s) after which such a refusal is raised as `DeviceError`. Other errors are
+    raised at once.
     """
     while True:
         try:
@@ -56,7 +59,8 @@ def retry_while_busy(link: Link, device: HelloReply, message: Message, give_up: 
 
 
 def _confirmed(link: Link, messages: Sequence[SetParams | SetStates]) -> InForce:
-    """Read back the set in force. Raises `DeviceError` if it is not the one that was sent."""
+    """Read back the set in force and return it. Raises `DeviceError` if there is none, or it differs from
+    `messages`."""
     reply = link.request(GetSet(bank=0))
     wrong, reported = differences(messages, reply), in_force(reply)
     if wrong or reported is None:

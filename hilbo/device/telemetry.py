@@ -28,7 +28,8 @@ class Samples(NamedTuple):
     flags: np.ndarray
 
     def table(self, tick_s: float, begun: int | None = None) -> Any:
-        """Pandas table of the samples, with `time_s` from the tick `begun`, or from the first sample."""
+        """Return the samples as a pandas table with the additional column `time_s`: the time (s) since the tick
+        `begun`, or since the first sample if that is None. `tick_s`: period of a tick (s)."""
         import pandas as pd
 
         since = (self.tick - (self.tick[:1].sum() if begun is None else begun)) * tick_s
@@ -37,7 +38,7 @@ class Samples(NamedTuple):
 
 
 def joined(pieces: Sequence[Samples]) -> Samples:
-    """Concatenate pieces of telemetry."""
+    """Concatenate pieces of telemetry, of which there must be at least one, in their order."""
     return Samples(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
 
 
@@ -67,7 +68,11 @@ class TelemetryBuffer:
         self.newest: Telemetry | None = None
 
     def add(self, message: Telemetry) -> None:
-        """Add a message, in the order of arrival."""
+        """Store a message, update the counts and `newest`, and wake up `wait`. A message without samples is ignored.
+
+        Messages must be added in the order of arrival. When the buffer is full, the oldest message is discarded and its
+        samples count as `unread`.
+        """
         if not message.samples:
             return
         with self._news:
@@ -87,28 +92,29 @@ class TelemetryBuffer:
 
     @property
     def tick(self) -> int:
-        """Tick after the newest sample; 0 before the first."""
+        """Tick at which the next sample is due, counted on beyond 2^32; 0 before the first sample."""
         with self._news:
             return self._next or 0
 
     def counts(self) -> Counts:
-        """Counts since the buffer was created."""
+        """Return the counts since the buffer was created; `take` does not reset them."""
         with self._news:
             return Counts(self._samples, self._dropped, self._missing, self._unread)
 
     @property
     def much(self) -> bool:
-        """Whether the buffer is more than half full and should be emptied."""
+        """Whether the buffer is more than half full, so that `take` should be called."""
         return len(self._messages) > _MOST // 2
 
     def wait(self, timeout: float) -> bool:
-        """Wait up to `timeout` seconds for new samples; return whether any came."""
+        """Block until samples are added, for up to `timeout` s; return whether any were."""
         with self._news:
             seen = self._samples
             return self._news.wait_for(lambda: self._samples != seen, timeout)
 
     def take(self) -> Samples:
-        """Remove and return all samples since the last call, oldest first."""
+        """Remove all stored samples from the buffer and return them, oldest first; the columns are empty if there are
+        none."""
         with self._news:
             messages = list(self._messages)
             self._messages.clear()

@@ -26,7 +26,7 @@ _COMPILERS = ("cc", "gcc", "clang")
 
 
 def compiled(name: str, what: str, parts: Sequence[str], sources: Sequence[str] = (), shared: bool = False) -> Path:
-    """Path of the program (or shared library) `name`, compiled if it is not in the cache.
+    """Return the path of the program (or shared library) `name` in the cache folder; compile it if it is not there.
 
     `what` names it in error messages. `parts`: the folders of its headers and sources. `sources`: patterns of the C
     files, if not all of these folders. Raises `DeviceError` if it cannot be built, with what to install, or if another
@@ -51,7 +51,7 @@ def compiled(name: str, what: str, parts: Sequence[str], sources: Sequence[str] 
 
 
 def _check_private(path: Path, what: str) -> None:
-    """Refuse what another user may have put into the cache. Raises `DeviceError`."""
+    """Raise `DeviceError` if the path exists and belongs to, or may be changed by, another user."""
     if os.path.lexists(path) and not is_private(path):
         raise DeviceError(
             f"{path}: {what} is not run, since this belongs to, or may be changed by, another user; delete it, or set"
@@ -60,7 +60,8 @@ def _check_private(path: Path, what: str) -> None:
 
 
 def _build(program: Path, what: str, command: Sequence[str], root: Path) -> None:
-    """Compile in a temporary folder and move the result to its place, so that concurrent builds do not interfere."""
+    """Run the compiler `command` in a temporary folder and move the result to `program`, so that concurrent builds do
+    not interfere. Raises `DeviceError` if the cache cannot be written, or the compilation fails."""
     try:
         program.parent.parent.mkdir(parents=True, exist_ok=True)
         program.parent.mkdir(mode=0o700, exist_ok=True)
@@ -83,7 +84,8 @@ def _build(program: Path, what: str, command: Sequence[str], root: Path) -> None
 
 
 def _sources(what: str) -> Path:
-    """Folder of the firmware's sources. Raises `DeviceError` if it is missing."""
+    """Find the folder of the firmware's sources, in the installation or a checkout. Raises `DeviceError` if it is
+    missing."""
     here = Path(__file__).parents[2]
     for root in (here / "firmware", here.parent / "firmware"):  # installed; a checkout
         if (root / "core").is_dir():
@@ -92,7 +94,7 @@ def _sources(what: str) -> Path:
 
 
 def _compiler(what: str) -> str:
-    """Path of the C compiler: $CC, cc, gcc or clang. Raises `DeviceError` if there is none."""
+    """Find the path of the first C compiler among $CC, cc, gcc and clang. Raises `DeviceError` if there is none."""
     for name in (os.environ.get("CC", ""), *_COMPILERS):
         path = shutil.which(name) if name else None
         if path:
@@ -105,10 +107,10 @@ def _compiler(what: str) -> str:
 
 
 def _firmware_hash(root: Path) -> int:
-    """CRC-32 of the core's sources, as in firmware/Makefile."""
+    """CRC-32 of the sources of the firmware's core, as in firmware/Makefile."""
     return zlib.crc32(b"".join(path.read_bytes() for path in sorted((root / "core").glob("*.[ch]"))))
 
 
 def _cache() -> Path:
-    """Cache folder of hilbo."""
+    """Cache folder of hilbo, $XDG_CACHE_HOME/hilbo or ~/.cache/hilbo; it is not created."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hilbo"

@@ -120,7 +120,8 @@ class _State(ctypes.Structure):
 
 @cache
 def library() -> ctypes.CDLL:
-    """The shared library, built if this computer has not built it before. Raises `DeviceError` where it cannot be."""
+    """Load the shared library, compiled first if it is not in the cache, and declare the types of its functions.
+    Repeated calls return the same object. Raises `DeviceError` if it cannot be built."""
     path = compiled("libhilbo_renderer.so", "the renderer library", ("core", "port/library"), _SOURCES, shared=True)
     lib = ctypes.CDLL(str(path))
     handle, u32, double = ctypes.c_void_p, ctypes.c_uint32, ctypes.c_double
@@ -186,10 +187,10 @@ class HostRenderer:
         exponentials: Sequence[tuple[float, float]] = (),
         force_limit: float | None = None,
     ) -> None:
-        """Check a set and stage it; it is put in force at the first tick that allows it (`state().set`).
+        """Check a parameter set and stage it; it is put in force at the first tick that allows it (`state().set`).
 
-        Units: N/mm, N·s^α/mm, N. `exponentials`: (weight, loss) pairs of full memory, instead of N. Raises
-        `InputError`.
+        Units: N/mm, N·s^α/mm, N. `exponentials`: (weight, loss) pairs of full memory, instead of N. `force_limit`: None
+        for the device's. Raises `InputError` for a set that the library refuses.
         """
         limit = self.numbers.force_limit_N if force_limit is None else force_limit
         packed = _packed(K0, K1, B1, alpha, N, exponentials, limit)
@@ -199,22 +200,22 @@ class HostRenderer:
     def start(self, stops: int) -> None:
         """Start rendering, from out of contact; `stops` is that of the `state()` inspected before.
 
-        Raises `DeviceError`.
+        Raises `DeviceError` if the library refuses, such as after another stop.
         """
         if self._lib.hilbo_start(self._handle, stops):
             raise DeviceError(self.sentence())
 
     def clear(self, stops: int) -> None:
-        """Change from HOLD or ESTOP to STOPPED; `stops` as in `start`. Raises `DeviceError`."""
+        """Change from HOLD or ESTOP to STOPPED; `stops` as in `start`. Raises `DeviceError` if the library refuses."""
         if self._lib.hilbo_clear(self._handle, stops):
             raise DeviceError(self.sentence())
 
     def stop(self) -> None:
-        """Ramp the force to zero within `hold_ticks`, then STOPPED."""
+        """Ramp the force to zero within `hold_ticks`; the state is then STOPPED."""
         self._lib.hilbo_stop(self._handle)
 
     def estop(self) -> None:
-        """Emergency stop: force zero at the next tick, latched."""
+        """Emergency stop: force zero at the next tick, and state ESTOP until `clear`."""
         self._lib.hilbo_estop(self._handle)
 
     def heartbeat(self) -> None:
@@ -222,38 +223,43 @@ class HostRenderer:
         self._lib.hilbo_heartbeat(self._handle)
 
     def tick(self, position_mm: float, velocity_mm_per_s: float, time_s: float) -> float:
-        """Compute the force (N) for one period; NaN for a quantity that the device does not provide."""
+        """Advance the renderer by one period and return the force (N) to output. NaN for a quantity that the device
+        does not provide."""
         return self._tick(self._handle, position_mm, velocity_mm_per_s, time_s)
 
     def state(self) -> HostState:
-        """Current state."""
+        """Current state, read from the library."""
         packed = _State()
         self._lib.hilbo_get_state(self._handle, ctypes.byref(packed))
         return HostState(*(getattr(packed, name) for name in HostState._fields))
 
     def sentence(self) -> str:
-        """Message about the last refusal."""
+        """Message of the library about the last refusal."""
         text = ctypes.create_string_buffer(_ROOM)
         self._lib.hilbo_sentence(self._handle, text, _ROOM)
         return text.value.decode()
 
     def why(self) -> str:
-        """Current state and its cause, in words."""
+        """Current state and its cause in words, such as "HOLD: …"."""
         now = self.state()
         return f"{State(now.state).name}: {self._lib.hilbo_cause_in_words(now.cause).decode()}"
 
 
 def K0_of(*, K_eff: float, K1: float, B1: float, alpha: float, N: int = 101, tick_rate_Hz: int = 1000) -> float:
-    """K0 (N/mm) of a short-memory set whose static stiffness is K_eff, as computed by the library.
+    """Compute the K0 (N/mm) with which a short-memory set of N samples has the static stiffness K_eff (N/mm).
 
-    Raises `InputError` for an N that is not an integer, `DeviceError` if the library cannot be built.
+    Raises `InputError` for an integer N that does not fit 32 unsigned bits, `DeviceError` if the library cannot be
+    built.
     """
     packed = _packed(0.0, K1, B1, alpha, N, (), math.nan)
     return library().hilbo_K0_of(ctypes.byref(packed), tick_rate_Hz, K_eff)
 
 
 def _packed(K0: float, K1: float, B1: float, alpha: float, N: int, exponentials: Any, limit: float) -> _Set:
-    """C struct of a parameter set. Raises `InputError` for too many exponentials or an N that does not fit 32 bits."""
+    """Build the C struct of a parameter set; N is ignored if there are exponentials, (weight, loss) pairs.
+
+    Raises `InputError` for too many exponentials, or an N that does not fit 32 unsigned bits.
+    """
     if len(exponentials) > _MOST_EXPONENTIALS:
         raise InputError(f"There are {len(exponentials)} exponentials; a set has at most {_MOST_EXPONENTIALS}.")
     packed = _Set(K0, K1, B1, alpha, limit, 0 if exponentials else _fits_u32(N), len(exponentials))
@@ -263,7 +269,7 @@ def _packed(K0: float, K1: float, B1: float, alpha: float, N: int, exponentials:
 
 
 def _fits_u32(value: Any) -> Any:
-    """Pass a number through. Raises `InputError` for an integer that does not fit 32 unsigned bits."""
+    """Return the value unchanged. Raises `InputError` for an integer that does not fit 32 unsigned bits."""
     if isinstance(value, int) and not 0 <= value < 2**32:
         raise InputError(f"{value} must be at least 0 and below 2^32.")
     return value

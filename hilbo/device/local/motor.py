@@ -59,7 +59,10 @@ class _Shared(ctypes.Structure):
 
 
 def motor_program() -> Path:
-    """Path of the program, compiled if it is not in the cache. Raises `DeviceError` if it cannot be built."""
+    """Path of the program `hilbo-motor`, compiled if it is not in the cache.
+
+    Raises `DeviceError` if it cannot be built, and on a system without POSIX.
+    """
     if os.name != "posix":
         raise DeviceError("The simulated motor needs POSIX (Linux, macOS); on Windows use WSL.")
     return compiled("hilbo-motor", "the simulated motor", _PARTS, _SOURCES)
@@ -95,11 +98,11 @@ class SimulatedMotor:
 
     @property
     def felt_N(self) -> float:
-        """Force that is output now, N."""
+        """Force that the simulated device outputs now, N."""
         return self._shared.felt_N
 
     def sample(self) -> tuple[float, float]:
-        """Newest position (mm) and velocity (mm/s)."""
+        """Newest position (mm) and velocity (mm/s) of the handle."""
         return self._shared.position_mm, self._shared.velocity_mm_per_s
 
     def command(self, force_N: float) -> None:
@@ -108,7 +111,7 @@ class SimulatedMotor:
         self._shared.commands += 1
 
     def close(self) -> None:
-        """End the process."""
+        """End the process, by a kill after 5 s, and delete the shared file."""
         assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.close()
         try:

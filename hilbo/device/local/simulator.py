@@ -46,13 +46,13 @@ class Simulator:
             raise InputError(f"The simulated device does not start: {words}")
 
     def alive(self) -> bool:
-        """Whether the process runs."""
+        """Whether the process is still running."""
         return self._process.poll() is None
 
     def tell(self, command: str) -> str:
-        """Send a command of `hilbo-device --help` ("restart", "finger sine", …) and return its answer.
+        """Send a command of `hilbo-device --help` ("restart", "finger sine", …) and return its answer, one line.
 
-        Raises `DeviceError` if the device has ended.
+        Raises `DeviceError` if the pipe to the device is closed; the answer is empty if the device ends meanwhile.
         """
         assert self._process.stdin is not None
         with self._telling:
@@ -64,23 +64,26 @@ class Simulator:
             return self._answer()
 
     def ticks(self, count: int) -> str:
-        """Run `count` ticks, in lockstep. Raises `DeviceError` if the process has ended."""
+        """Run `count` ticks in lockstep, and return the device's answer. Raises `DeviceError` if the process has
+        ended."""
         answer = self.tell(f"tick {count}")
         if not answer.startswith("tick "):
             raise DeviceError("The simulated device has ended; open a new one.")
         return answer
 
     def close(self) -> str:
-        """End the process; return its final report: ticks run, and how many were late."""
+        """End the process; return its final report (ticks run, and how many were late), or "" if it was closed
+        before."""
         return self._ended()
 
     def _answer(self) -> str:
-        """Next line of the process's output."""
+        """Next line of the process's output, without blanks around it; empty if the output has ended."""
         assert self._process.stdout is not None
         return self._process.stdout.readline().decode().strip()
 
     def _ended(self) -> str:
-        """Close and end the process; return its error output."""
+        """Close the pipes and end the process, by a kill after 2 s; return its error output, or "" if it was closed
+        before."""
         if self._process.stderr is None or self._process.stderr.closed:
             return ""
         with contextlib.suppress(OSError, ValueError):
@@ -99,7 +102,7 @@ class Simulator:
 def built() -> Path:
     """Path of the simulated device's program, compiled if it is not in the cache.
 
-    Raises `DeviceError` if it cannot be built or run, with what to install.
+    Raises `DeviceError`, with what to install, if it cannot be built or the system has no pseudo-terminals.
     """
     if os.name != "posix":
         raise DeviceError(
@@ -109,7 +112,8 @@ def built() -> Path:
 
 
 def _arguments(options: dict[str, Any]) -> list[str]:
-    """Command-line arguments for the options; `sensor=False` becomes --no-sensor."""
+    """Command-line arguments for the options. `sensor=False` becomes --no-sensor, True a flag without a value, a
+    sequence numbers with commas; None and False are left out."""
     arguments = []
     for name, value in options.items():
         if name == "sensor":
