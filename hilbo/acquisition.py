@@ -41,12 +41,16 @@ class UCB(eqx.Module):
     weight: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.7)
 
     def __call__(self, mean, variance):
+        """Score of posterior `mean` and `variance`, arrays of one shape, which is also the result's; NaN for a negative
+        variance.
+        """
         return mean + self.weight.astype(mean.dtype) * jnp.sqrt(variance)
 
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
-        """Upper bound of the score given the posterior mean, with at most the `prior` variance.
+        """Upper bound of the score given the posterior mean, for every variance up to the `prior` variance; mean's
+        shape.
 
-        `weight` is not negative.
+        Valid for a `weight` that is not negative.
         """
         return self(mean, prior)
 
@@ -60,28 +64,38 @@ class LogEI(eqx.Module):
     best: Float[Array, ""] = eqx.field(converter=jnp.asarray)
 
     def __call__(self, mean, variance):
+        """Score of posterior `mean` and `variance`, arrays of one shape, which is also the result's; may be -inf."""
         gain, certain = mean - self.best.astype(mean.dtype), variance == 0
         sd = jnp.sqrt(jnp.where(certain, 1.0, variance))
         sure = jnp.where(gain > 0, jnp.log(jnp.where(gain > 0, gain, 1.0)), -jnp.inf)
         return jnp.where(certain, sure, jnp.log(sd) + _log_improvement(gain / sd))
 
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
-        """Upper bound of the score given the posterior mean, reached with all of the `prior` variance left."""
+        """Upper bound of the score given the posterior mean, for every variance up to the `prior` variance; mean's
+        shape.
+
+        The score rises with the variance, so the bound is the score at the prior variance.
+        """
         return self(mean, prior)
 
 
 class TopCategory(eqx.Module):
-    """Log probability of the highest category: `threshold` is its lower edge, `noise` the sd of the response noise."""
+    """Log probability that the response is in the highest category.
+
+    `threshold`: lower edge of that category; `noise`: standard deviation of the response noise; scalars.
+    """
 
     threshold: Float[Array, ""] = eqx.field(converter=jnp.asarray)
     noise: Float[Array, ""] = eqx.field(converter=jnp.asarray)
 
     def __call__(self, mean, variance):
+        """Score of posterior `mean` and `variance`, arrays of one shape, which is also the result's."""
         spread = jnp.sqrt(self.noise.astype(mean.dtype) ** 2 + variance)
         return jax.scipy.special.log_ndtr((mean - self.threshold.astype(mean.dtype)) / spread)
 
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
-        """Upper bound of the score given the posterior mean.
+        """Upper bound of the score given the posterior mean, for every variance up to the `prior` variance; mean's
+        shape.
 
         Reached with variance 0 where the mean is above the threshold, and with the `prior` variance below it.
         """
@@ -89,7 +103,10 @@ class TopCategory(eqx.Module):
 
 
 def _log_improvement(z: Float[Array, "*m"]) -> Float[Array, "*m"]:
-    """log(phi(z) + z Phi(z)), for z < 0 as phi(z) (1 - |z| Q/phi) = phi(z) * excess / hazard to avoid cancellation."""
+    """log(phi(z) + z Phi(z)), elementwise, of any shape.
+
+    For z < 0 it is computed as phi(z) (1 - |z| Q/phi) = phi(z) * excess / hazard to avoid cancellation.
+    """
     below = jnp.where(z < 0, -z, 0.0)
     excess = excess_hazard(below)
     left = -0.5 * below**2 - HALF_LOG_2PI + jnp.log(excess) - jnp.log(below + excess)
@@ -119,8 +136,11 @@ def maximise(
     - `score`: the same score for one point, differentiable.
     - `allowed`: which points may be chosen, e.g. none too close to earlier ones.
     - `starts`, `steps`: number of candidates, at least 0.1 apart, that are refined, and the largest number of Newton
-      steps of each; 0 starts means no refinement.
+      steps of each; 0 starts: the best candidate, not refined.
     - `search`: the feasible set, as [`climb`][hilbo.numerics.climbing.climb] takes it: `space.searched`.
+
+    **Returns:** the best point (d,), its score, the row of the best candidate in `candidates`, and that candidate's
+    score. Both scores are -inf if no candidate is allowed.
     """
     if allowed is not None:
         values = jnp.where(jax.vmap(allowed)(candidates), values, -jnp.inf)
@@ -133,9 +153,9 @@ def maximise(
 def thompson(
     key: PRNGKeyArray, mean: Float[Array, " m"], covariance: Float[Array, "m m"]
 ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
-    """Index of the maximum of one joint draw of f at m candidates, and the draw (m,).
+    """Index of the maximum of one joint draw of f at m candidates, a scalar, and the draw (m,).
 
-    `covariance` is the joint posterior covariance, (m, m); its eigenvector root needs no jitter.
+    `mean` (m,) and `covariance` (m, m): of the joint posterior; negative eigenvalues of the covariance are taken as 0.
     """
     eigenvalues, vectors = eigh(covariance)
     root = vectors * jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[None, :]

@@ -43,13 +43,21 @@ _one_program = functools.partial(jax.jit, inline=True)
 
 
 class Evidence(eqx.Module):
-    """Running sum of the participants' evidence at m points: added precision, and precision-weighted means."""
+    """Running sum of the participants' evidence at m points.
+
+    `added` (m,): sum of the precisions that the participants add to the prior's; `weighted` (m,): sum of their
+    posterior means, each divided by its posterior variance.
+    """
 
     added: Float[Array, " m"]
     weighted: Float[Array, " m"]
 
     def merge(self, prior_variance: Float[Array, "..."]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of the population map."""
+        """Mean and variance (m,) of the population map; `prior_variance` k is a scalar or (m,).
+
+        Nothing is checked: where the total precision 1 / k + `added` is not positive, the variance is negative or
+        infinite.
+        """
         variance = prior_variance / (1.0 + prior_variance * self.added)
         return variance * self.weighted, variance
 
@@ -63,12 +71,13 @@ def combine(
 
     - `means`, `variances`: (M, m).
     - `prior_variance`: k, a scalar or (m,), the same for all participants.
-    - `mask`: (M,), False for absent participants.
-    - `throw`: raise `InputError` for means that are not finite, for variances that are not positive, and if no positive
-      precision is left; `False` returns NaN there.
+    - `mask`: (M,), False for absent participants, whose rows have no influence; without any participant the result is
+      the prior, mean 0 and variance k.
+    - `throw`: raise `InputError` (under `jit` a run-time error of equinox) for means that are not finite, for variances
+      that are not positive, and if no positive precision is left; `False` returns NaN at those points.
 
-    The rows of an absent participant have no influence. If the explained variance is known directly,
-    [`combine_explained`][] is more precise for weak experts.
+    Raises `InputError` for other shapes and for a mask that is not boolean. If the explained variance is known
+    directly, [`combine_explained`][] is more precise for weak experts.
     """
     means, variances, prior = _people(means, "variances", variances, prior_variance)
     return combine_explained(means, prior[None, :] - variances, prior, mask=mask, throw=throw)
@@ -77,9 +86,9 @@ def combine(
 def combine_explained(
     means: Numbers, explained: Numbers, prior_variance: Numbers, *, mask: Numbers | None = None, throw: bool = True
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Population mean and variance as [`combine`][], from the variances e_j = k - sigma_j^2 explained, (M, m).
+    """Population mean and variance (m,) as [`combine`][], from the explained variances e_j = k - sigma_j^2, (M, m).
 
-    Raises `InputError` for other shapes, and as `combine`.
+    The other arguments and the errors raised are those of `combine`.
     """
     means, explained, prior = _people(means, "explained", explained, prior_variance)
     merged, invalid = _merged(means, explained, prior, _present(mask, means))
@@ -91,10 +100,12 @@ def stream(
     experts: PyTree,
     prior_variance: Float[Array, ""] | Float[Array, " m"],
 ) -> Evidence:
-    """Accumulate the evidence of many experts one after the other, to limit memory use.
+    """Sum the evidence of many experts one after the other, to limit memory use; nothing is checked.
 
-    **Arguments:** `expert`: gives mean and explained variance (m,) of one expert; `experts`: its arguments, stacked
-    along a leading axis of length M.
+    **Arguments:** `expert`: returns mean and explained variance (m,) of one expert; `experts`: its argument, a pytree
+    stacked along a leading axis of length M; `prior_variance`: k, a scalar or (m,).
+
+    **Returns:** the sums at the m points; their `merge` gives the population map.
     """
 
     def evidence_of(one):
@@ -111,8 +122,9 @@ def average(
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Plain average of the latent functions, for comparison (paper, section II-C): all participants have equal weight.
 
-    Mean (m,), and the variance (m,) of the mean of independent functions. Raises `InputError` for other shapes, and if
-    no participant is present; if that is traced, the average is NaN.
+    Returns the mean (m,) of the `means` (M, m), and its variance (m,) for independent functions: the sum of the
+    `variances` (M, m) over the squared number of participants present in `mask` (M,). Raises `InputError` for other
+    shapes or another type of mask, and if no participant is present; if the mask is traced, the average is then NaN.
     """
     means, variances, _ = _people(means, "variances", variances, 1.0)
     present = _present(mask, means)
@@ -123,7 +135,7 @@ def average(
 
 @_one_program
 def _averaged(means: Float[Array, "M m"], variances: Float[Array, "M m"], present: Bool[Array, " M"]) -> _Map:
-    """Compute `average` from checked arrays."""
+    """Mean and variance (m,) of `average` from checked arrays; NaN if no participant is present."""
     means, variances = _present_rows(present, means), _present_rows(present, variances)
     count = jnp.sum(present)
     count = jnp.where(count > 0, count.astype(means.dtype), jnp.nan)
@@ -134,7 +146,11 @@ def _averaged(means: Float[Array, "M m"], variances: Float[Array, "M m"], presen
 def _merged(
     means: Float[Array, "M m"], explained: Float[Array, "M m"], prior: Float[Array, " m"], present: Bool[Array, " M"]
 ) -> tuple[_Map, Bool[Array, " m"]]:
-    """Population map of the committee machine, NaN at invalid points; and the mask of invalid points."""
+    """Population map of the committee machine, NaN at invalid points; and the mask (m,) of invalid points.
+
+    Invalid: a present participant has a mean that is not finite or a variance that is not positive, or the total
+    precision is not positive.
+    """
     means, explained = _present_rows(present, means), _present_rows(present, explained)
     evidence = _evidence(means, explained, prior)
     invalid = _invalid(means, explained, prior) | ~(1.0 + prior * evidence.added > 0.0)
@@ -148,14 +164,14 @@ def _present_rows(present: Bool[Array, " M"], rows: Float[Array, "M m"]) -> Floa
 
 
 def _evidence(means: Float[Array, "M m"], explained: Float[Array, "M m"], prior: Float[Array, " m"]) -> Evidence:
-    """Evidence of the experts, summed."""
+    """Evidence of the M experts summed: explained / (k (k - explained)), and means / (k - explained), (m,) each."""
     remaining = prior[None, :] - explained
     added, weighted = explained / (prior[None, :] * remaining), means / remaining
     return Evidence(jnp.sum(added, axis=0), jnp.sum(weighted, axis=0))
 
 
 def _add(left: Evidence, right: Evidence) -> Evidence:
-    """Sum of two running sums."""
+    """Elementwise sum of two records of evidence."""
     return jax.tree.map(jnp.add, left, right)
 
 
@@ -164,7 +180,8 @@ def _people(
 ) -> tuple[Float[Array, "M m"], Float[Array, "M m"], Float[Array, " m"]]:
     """Check `means`, `others` (called `name` in errors) and the prior variance; return them as arrays of one dtype.
 
-    The prior variance is broadcast to the points. Raises `InputError` for other shapes.
+    `means` and `others` keep their shape (M, m); the prior variance, a scalar or (m,), is broadcast to (m,). Raises
+    `InputError` for other shapes and for values that are not numbers.
     """
     dtype = np.promote_types(float_dtype(means), float_dtype(others))
     means, others = numbers("bcm", "means", means, dtype), numbers("bcm", name, others, dtype)
@@ -183,7 +200,10 @@ def _people(
 
 
 def _present(mask: Numbers | None, means: Float[Array, "M m"]) -> Bool[Array, " M"]:
-    """Mask of the participants who are present. Raises `InputError` for a mask of another shape or type."""
+    """Mask (M,) of the participants who are present, all of them if `mask` is None.
+
+    Raises `InputError` for a mask of another shape, or one that is not boolean.
+    """
     if mask is None:
         return to_device(np.ones(means.shape[0], bool))
     flags = numbers("bcm", "mask", mask)
@@ -198,12 +218,15 @@ def _present(mask: Numbers | None, means: Float[Array, "M m"]) -> Bool[Array, " 
 def _invalid(
     means: Float[Array, "M m"], explained: Float[Array, "M m"], prior: Float[Array, " m"]
 ) -> Bool[Array, " m"]:
-    """Points at which some expert's mean is not finite, or some variance is not positive."""
+    """Mask (m,) of points at which some mean is not finite, or some variance k - explained is not positive."""
     return jnp.any(~jnp.isfinite(means) | ~(prior[None, :] - explained > 0.0), axis=0)
 
 
 def _raise_if(invalid: Bool[Array, " m"], merged: _Map) -> _Map:
-    """Return the map; raise `InputError` (under `jit` an equinox error) if a point is invalid."""
+    """Return the map `merged` unchanged; raise `InputError` (under `jit` an equinox error) if any point is `invalid`.
+
+    The error names the first such point.
+    """
     message = (
         "bcm: an expert's mean is no number, a variance is not positive, or the experts' variances exceed the prior's"
         " so far that no positive precision is left; check that prior_variance is the one all experts were fitted with"

@@ -25,7 +25,9 @@ class InputRemark(UserWarning):
 
 
 def warn_caller(sentence: str) -> None:
-    """Issue an `InputRemark` attributed to the nearest caller outside hilbo and the packages wrapping its functions."""
+    """Issue an `InputRemark` with this message, attributed to the nearest caller outside hilbo, equinox, jaxtyping and
+    beartype; to the outermost frame if there is none.
+    """
     level, frame = 1, sys._getframe()
     while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
         level, frame = level + 1, frame.f_back

@@ -15,7 +15,9 @@ _ROUNDING = 1e-3  # tolerance beyond the unit cube without a remark
 
 
 def check_shapes(kernel: Kernel, likelihood: OrdinalProbit, trials: Trials, start: Float[Array, "..."] | None) -> None:
-    """Raise `InputError` if the shapes of model, responses and `start` do not match."""
+    """Raise `InputError` if the shapes of kernel, likelihood, trials and `start` (one weight per row, or None) do not
+    match, or if the trials are stacked. Custom kernels are not checked.
+    """
     if trials.mask.ndim != 1:
         raise InputError(
             f"fit: these trials hold {len(trials.mask)} people; fit those of one, or use jax.vmap with throw=False."
@@ -30,7 +32,9 @@ def check_shapes(kernel: Kernel, likelihood: OrdinalProbit, trials: Trials, star
 
 
 def _check_kernel(kernel: Stationary, dim: int) -> None:
-    """Raise `InputError` if the kernel's parameters do not match the dimension of the points."""
+    """Raise `InputError` if theta is neither a scalar nor of length `dim`, if the variance is no scalar, or if the
+    number of levels is not `dim`.
+    """
     if jnp.shape(kernel.theta) not in ((), (dim,)):
         raise InputError(
             f"fit: theta has shape {jnp.shape(kernel.theta)} and x {dim} parameters; give one number or {dim}."
@@ -42,7 +46,10 @@ def _check_kernel(kernel: Stationary, dim: int) -> None:
 
 
 def check_answers(trials: Trials, categories: int) -> None:
-    """Raise `InputError` for points that are not finite, and for responses outside the categories; for known values."""
+    """Raise `InputError` for a point that is not finite, and for a category outside 0 to `categories` - 1.
+
+    The values must be known, not traced. All rows are checked, those without a response too.
+    """
     finite, q = np.isfinite(trials.x).all(axis=-1), np.asarray(trials.q)
     if not finite.all():
         row = int(np.argmin(finite))
@@ -55,10 +62,10 @@ def check_answers(trials: Trials, categories: int) -> None:
 
 
 def remark_outside(whose: str, kernel: Kernel, points: Float[np.ndarray, "n d"]) -> None:
-    """Warn of points (n, d) outside the unit cube by more than rounding, such as those in physical units.
+    """Issue an `InputRemark` if any of the points (n, d) is outside the unit cube by more than 1e-3.
 
-    Responses there are almost independent, and predictions are the prior. Only for stationary kernels; `whose` begins
-    the warning.
+    Such points may be in physical units: responses there are almost independent, and predictions are the prior. Kernels
+    that are not stationary are not checked; `whose` begins the warning.
     """
     if not isinstance(kernel, Stationary):
         return

@@ -116,9 +116,10 @@ def certify(
 ) -> Certificate:
     """Compute the certificate of the posterior with these `weights` a, `curvature` W and `factor` V.
 
-    `search`: diagnostics of the search, such as residual and tolerance. K a, which predictions use, and the mode are
-    equal except for rounding, and may differ by eps^(1/4) prior standard deviations. `covariance` and `factor` (n, n);
-    `mode`, `weights` and `curvature` (n,).
+    `covariance` and `factor` (n, n); `mode`, `weights` and `curvature` (n,); `curvature_at`: eta (n,) -> W (n,);
+    `search`: the fields of the certificate that the search determined, residual, tolerance, iterations, jitter and
+    condition. The certificate is converged only if `mode` and K a, which predictions use and which should be equal
+    except for rounding, differ by at most eps^(1/4) prior standard deviations. Never raises.
     """
     epsilon, prior = jnp.finfo(weights.dtype).eps, jnp.diagonal(covariance)
     largest, sd = jnp.max(prior), jnp.sqrt(prior)
@@ -150,15 +151,16 @@ def evidence_error(
     posterior: tuple[Vector, Callable[[Float[Array, "n k"]], Float[Array, "n k"]]],
     curvature_at: Callable[[Vector], Vector],
 ) -> Scalar:
-    """Error of Laplace's log evidence due to an inexact `mode`, with `weights` a and `curvature` W there.
+    """Bound, to first order, on the error of Laplace's log evidence due to an inexact `mode`: a scalar >= 0, in nats.
 
-    `posterior`: variances, and a function that multiplies by C.
+    `covariance` (n, n); `mode`, `weights` a and `curvature` W at the mode, (n,); `posterior`: variances (n,), and a
+    function that multiplies columns (n, k) by C; `curvature_at`: eta (n,) -> W (n,).
 
     To first order the mode has the error d = P (K a - mode), P = (I + KW)^-1 = I - K C, plus the rounding P eps |K| |a|
     + eps |mode|. The log posterior being stationary, the sums in the log evidence change by at most sum W d^2 / 2;
     log|I + KW| / 2 changes by sum s dW / 2, s being the posterior variances, dW the change of the curvatures within d.
     Where the noise is far below the prior's standard deviation, this detects errors that a residual in units of the
-    latter cannot. `covariance` (n, n); `mode`, `weights` and `curvature` (n,) -> a scalar, in nats.
+    latter cannot.
     """
     epsilon, (variance, multiply_by_C) = jnp.finfo(weights.dtype).eps, posterior
     rounding = epsilon * (jnp.abs(covariance) @ jnp.abs(weights))
@@ -170,11 +172,10 @@ def evidence_error(
 
 
 def evidence_rounding(covariance: Matrix, weights: Float[Array, "k n"]) -> Scalar:
-    """Error in the sum of a'K a / 2 over the rows a of `weights` due to the rounding of K.
+    """Error in the sum of a'K a / 2 over the rows a of `weights` due to the rounding of K: a scalar >= 0, in nats.
 
     Estimated by rounding K once more in several ways, and taking the differences. Equal elements of K are rounded
-    alike, so contradictory responses at one point cause no error. `covariance` (n, n), `weights` (k, n) -> a scalar, in
-    nats.
+    alike, so contradictory responses at one point cause no error. `covariance` (n, n), `weights` (k, n).
     """
     factors = jnp.asarray(_ROUNDING_FACTORS, weights.dtype)[:, None, None]
     rounded = covariance[None, :, :] * factors / factors - covariance[None, :, :]
@@ -198,22 +199,26 @@ def evidence_tolerance(log_evidence: Scalar) -> Scalar:
 
 def distance(off: Float[Array, "..."], moved: Float[Array, "..."]) -> Scalar:
     """Upper bound sqrt(|off| |K off|) of sqrt(off' K off), the distance of weights a from the mode in standard
-    deviations of the prior, where `off` is slope - a and `moved` is K off, of one shape. Rounding does not
-    make it negative."""
+    deviations of the prior: a scalar. `off` is slope - a and `moved` is K off, of one shape. Rounding does not make it
+    negative.
+    """
     return jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(moved))
 
 
 def residual_tolerance(rounding: Float[Array, "..."]) -> Float[Array, "..."]:
-    """What the residual of a search for a mode or a fixed point has to reach: eps^(2/3), or the rounding error of the
-    residual itself, from the size `rounding` of its terms, where that is larger; eps^(1/4) at most."""
+    """Tolerance of the residual of a search for a mode or a fixed point: 4 eps `rounding`, but at least eps^(2/3) and
+    at most eps^(1/4), elementwise. `rounding`, of any shape: size of the terms whose sum is the residual; 0 if their
+    rounding error is not to count.
+    """
     epsilon = jnp.finfo(rounding.dtype).eps
     return jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
 
 
 def shortfall(certificate: Any, log_evidence: Scalar) -> str:
-    """Message on why a certificate is not converged, with possible remedies.
+    """Explain why a certificate is not converged, with possible remedies, as the second half of a sentence.
 
-    `certificate` may be that of a sampled posterior.
+    Such as "not found: its residual is ...; use a larger noise, float64", after which the caller names a last remedy.
+    `certificate` may also be that of a sampled posterior. The values must be known, not traced.
     """
     remedy, residual = "use a larger noise, float64", f"{float(certificate.residual):.3g}"
     if not bool(certificate.residual <= certificate.tolerance) and not bool(jnp.isnan(certificate.tolerance)):
@@ -242,7 +247,7 @@ def shortfall(certificate: Any, log_evidence: Scalar) -> str:
 
 
 def still(terms: Terms) -> Terms:
-    """Copy of the terms without derivatives by their arrays (`stop_gradient`)."""
+    """Copy of a pytree whose arrays are constants to differentiation (`stop_gradient`)."""
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, terms)
 
 
@@ -250,11 +255,13 @@ def still(terms: Terms) -> Terms:
 def mean_and_explained(
     weights: Vector, factor: Matrix, inverse: Matrix, cross: Float[Array, "n m"]
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Posterior mean `k*'a` at m points, and the explained variance `k*'C k*`: prior minus posterior variance.
+    """Posterior mean `k*'a` at m points, and the explained variance `k*'C k*`: prior minus posterior variance; (m,)
+    each.
 
     The latter is a sum of squares: never negative, and without cancellation.
 
     **Arguments:** `weights`, `factor` and `inverse` of a posterior; `cross`, prior covariances (n, m) of eta and f*.
+    The values come from `factor`, the derivatives from `inverse`.
     """
     del inverse
     # One product for both; the barrier keeps XLA from computing every covariance once more for each row of it.
@@ -266,7 +273,7 @@ def mean_and_explained(
 def _mean_and_explained_jvp(
     primals: tuple[Array, ...], tangents: tuple[Array, ...]
 ) -> tuple[tuple[Float[Array, " m"], Float[Array, " m"]], tuple[Float[Array, " m"], Float[Array, " m"]]]:
-    """Derivative by weights, inverse and covariances."""
+    """Result of `mean_and_explained` and its tangents, by weights, inverse and covariances, not by the factor."""
     weights, _, inverse, cross = primals
     d_weights, _, d_inverse, d_cross = tangents
     d_mean = d_weights @ cross + weights @ d_cross
@@ -275,11 +282,11 @@ def _mean_and_explained_jvp(
 
 
 def square_root(covariance: Matrix) -> tuple[Matrix, Scalar]:
-    """R with R R' = K, and the largest element of R R' - K.
+    """R with R R' = K up to rounding, (n, n), and the largest absolute element of R R' - K, a scalar.
 
     One Cholesky step removes the component common to all eta's, the largest part of a large K; the eigenvectors of the
     rest are found to eps times a much smaller norm. The rest is positive semi-definite, so negative eigenvalues are
-    rounding errors and set to 0; the resulting change of K is measured. (n, n) -> (n, n) and a scalar.
+    rounding errors and set to 0; the resulting change of K is measured. `covariance` (n, n), of any rank.
     """
     first = covariance[0, 0]
     shared = covariance[:, 0] / jnp.sqrt(jnp.where(first > 0, first, 1.0))
@@ -292,9 +299,9 @@ def square_root(covariance: Matrix) -> tuple[Matrix, Scalar]:
 
 
 def factorise(covariance: Matrix, curvature: Vector) -> tuple[Vector, Matrix, Matrix]:
-    """W^(1/2) as a vector, B = I + W^(1/2) K W^(1/2), and its Cholesky factor L.
+    """W^(1/2) as a vector (n,), B = I + W^(1/2) K W^(1/2), (n, n), and its lower Cholesky factor L, (n, n).
 
-    `covariance` (n, n), `curvature` (n,) -> (n,), (n, n), (n, n).
+    `covariance` K (n, n), `curvature` W >= 0 (n,).
     """
     root = jnp.sqrt(curvature)
     matrix = jnp.eye(root.shape[0], dtype=root.dtype) + root[:, None] * covariance * root[None, :]
@@ -302,11 +309,10 @@ def factorise(covariance: Matrix, curvature: Vector) -> tuple[Vector, Matrix, Ma
 
 
 def factor(covariance: Matrix, curvature: Vector) -> tuple[Matrix, Scalar]:
-    """V = L^-1 W^(1/2) with B = L L', so V'V = C.
+    """V = L^-1 W^(1/2) with B = L L', so that V'V = C; and an upper bound on the condition number of B.
 
-    And an upper bound on B's condition number (its eigenvalues are >= 1).
-
-    `covariance` (n, n), `curvature` (n,) -> (n, n) and a scalar.
+    The bound is the Frobenius norm of B, whose eigenvalues are >= 1. `covariance` K (n, n), `curvature` W (n,) -> (n,
+    n) and a scalar.
     """
     root, matrix, lower = factorise(covariance, curvature)
     return solve_lower(lower, jnp.diag(root)), jnp.linalg.norm(matrix)
@@ -314,7 +320,7 @@ def factor(covariance: Matrix, curvature: Vector) -> tuple[Matrix, Scalar]:
 
 @jax.custom_jvp
 def inverse_and_log_determinant(covariance: Matrix, curvature: Vector) -> tuple[Matrix, Scalar]:
-    """C, and log|B| = log|I + K W|. `covariance` (n, n), `curvature` (n,) -> (n, n) and a scalar."""
+    """C = (K + 1/W)^-1, and log|I + K W|. `covariance` K (n, n), `curvature` W (n,) -> (n, n) and a scalar."""
     root, _, lower = factorise(covariance, curvature)
     factor = solve_lower(lower, jnp.diag(root))
     return factor.T @ factor, 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower)))
@@ -324,7 +330,10 @@ def inverse_and_log_determinant(covariance: Matrix, curvature: Vector) -> tuple[
 def _inverse_and_log_determinant_jvp(
     primals: tuple[Array, ...], tangents: tuple[Array, ...]
 ) -> tuple[tuple[Matrix, Scalar], tuple[Matrix, Scalar]]:
-    """With T = I - C K: dC = -C dK C + T dW T' and d log|B| = tr(C dK) + tr(K T dW); no 1/W, no W^(1/2)."""
+    """Result of `inverse_and_log_determinant` and its tangents.
+
+    With T = I - C K: dC = -C dK C + T dW T' and d log|B| = tr(C dK) + tr(K T dW); no 1/W, no W^(1/2).
+    """
     covariance, _ = primals
     d_covariance, d_curvature = tangents
     inverse, log_determinant = inverse_and_log_determinant(*primals)

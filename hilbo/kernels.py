@@ -37,11 +37,11 @@ class Kernel(Protocol):
     """Interface of a covariance function."""
 
     def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"], /) -> Float[Array, ""]:
-        """Covariance of the latent function at two points."""
+        """Covariance of the latent function at two points, (d,) each; a scalar."""
         ...
 
     def diagonal(self, x: Float[Array, " d"], /) -> Float[Array, ""]:
-        """Variance of the latent function at a point: the covariance with itself, without its rounding.
+        """Prior variance of the latent function at a point: k(x, x), computed without rounding error.
 
         `x` (d,) -> a scalar.
         """
@@ -80,18 +80,26 @@ class RBF(eqx.Module):
         return RBF(theta, variance, self.levels)
 
     def __call__(self, x: Shaped[Array, " d"], y: Shaped[Array, " d"]) -> Float[Array, ""]:
-        """Covariance of the latent function at `x` and at `y`, both (d,)."""
+        """Covariance of the latent function at `x` and at `y`, both (d,); a scalar, NaN for a negative theta or
+        variance.
+        """
         x, y = floats(x, self.variance.dtype), floats(y, self.variance.dtype)
         return _possible(self.variance).astype(x.dtype) * jnp.exp(-_squared(self, x, y))
 
     def along(self, axis: int, x: Shaped[Array, " n"], y: Shaped[Array, " m"]) -> Float[Array, "n m"]:
-        """Factor (n, m) of one numeric coordinate: the kernel is the product of these factors and the variance."""
+        """Factor (n, m) of the numeric coordinate `axis` at its values `x` (n,) and `y` (m,): exp(-theta (x_i -
+        y_j)^2).
+
+        The kernel is the product of these factors over all coordinates, times the variance. NaN for a negative theta.
+        """
         theta = self.theta[axis] if self.theta.ndim else self.theta
         x, y = floats(x, theta.dtype), floats(y, theta.dtype)
         return jnp.exp(-_possible(theta).astype(x.dtype) * (x[:, None] - y[None, :]) ** 2)
 
     def diagonal(self, x: Shaped[Array, " d"]) -> Float[Array, ""]:
-        """Prior variance at a point, which is constant. `x` (d,) -> a scalar."""
+        """Prior variance at a point, which is the same everywhere. `x` (d,) -> a scalar, NaN for a negative
+        variance.
+        """
         return _possible(self.variance).astype(floats(x, self.variance.dtype).dtype)
 
 
@@ -122,12 +130,16 @@ class Matern32(eqx.Module):
         return Matern32(theta, variance, self.levels)
 
     def __call__(self, x: Shaped[Array, " d"], y: Shaped[Array, " d"]) -> Float[Array, ""]:
-        """Covariance of the latent function at `x` and at `y`, both (d,)."""
+        """Covariance of the latent function at `x` and at `y`, both (d,); a scalar, NaN for a negative theta or
+        variance.
+        """
         x, y = floats(x, self.variance.dtype), floats(y, self.variance.dtype)
         return _possible(self.variance).astype(x.dtype) * _matern32(6.0 * _squared(self, x, y))
 
     def diagonal(self, x: Shaped[Array, " d"]) -> Float[Array, ""]:
-        """Prior variance at a point, which is constant. `x` (d,) -> a scalar."""
+        """Prior variance at a point, which is the same everywhere. `x` (d,) -> a scalar, NaN for a negative
+        variance.
+        """
         return _possible(self.variance).astype(floats(x, self.variance.dtype).dtype)
 
 
@@ -143,9 +155,9 @@ class Levels(NamedTuple):
 
 
 def theta_of(kernel: type[Stationary], correlation: float) -> float:
-    """theta of a categorical coordinate for which two levels have this correlation, other coordinates being equal.
+    """theta of a categorical coordinate for which two different levels have this correlation, other coordinates equal.
 
-    `correlation`: above 0 and below 1.
+    `kernel`: the class, `RBF` or `Matern32`; `correlation`: above 0 and below 1, not checked.
     """
     if kernel is RBF:
         return -math.log(correlation)
@@ -156,9 +168,11 @@ def theta_of(kernel: type[Stationary], correlation: float) -> float:
 
 
 def embedded(kernel: Stationary, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n e"]:
-    """Map points (n, d) to coordinates (n, e) in which the kernel's squared distance is Euclidean.
+    """Map points (n, d) of the unit cube to coordinates (n, e) in which the squared Euclidean distance is theta |x -
+    x'|^2.
 
-    Numeric coordinates times the root of theta; a coordinate of k levels becomes k coordinates, one of which is not 0.
+    A numeric coordinate is multiplied by the root of its theta; a categorical one of k levels becomes k coordinates,
+    all 0 but that of the level, which is the root of theta / 2.
     """
     theta = np.broadcast_to(np.asarray(kernel.theta), x.shape[1])
     columns = []
@@ -171,21 +185,22 @@ def embedded(kernel: Stationary, x: Float[np.ndarray, "n d"]) -> Float[np.ndarra
 
 
 def _numbers_shown(kernel: Stationary) -> str:
-    """Parameters of a kernel for its repr."""
+    """Arguments of a kernel as text for its repr: theta, variance, and levels if it has any."""
     levels = f", levels={kernel.levels}" if kernel.levels else ""
     return f"theta={shown(kernel.theta)}, variance={shown(kernel.variance)}{levels}"
 
 
 def _possible(value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Parameter of a kernel, NaN below 0, since traced values cannot be refused."""
+    """The values of a parameter, NaN where they are negative: traced values cannot raise an error."""
     return jnp.where(value < 0, jnp.nan, value)
 
 
 def _squared(kernel: Stationary, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
-    """Scaled squared distance theta |x - y|^2, summed coordinate by coordinate.
+    """Scaled squared distance theta |x - y|^2 of two points, a scalar: over categorical coordinates the sum of theta
+    where the levels differ. NaN for a negative theta.
 
-    Under vmap this becomes one fused loop over pairs, about three times faster than a reduction over an axis of length
-    d, and it avoids the cancellation in |x|^2 + |y|^2 - 2xy.
+    Summed coordinate by coordinate: under vmap this becomes one fused loop over pairs, about three times faster than a
+    reduction over an axis of length d, and it avoids the cancellation in |x|^2 + |y|^2 - 2xy.
     """
     theta = jnp.broadcast_to(_possible(kernel.theta), x.shape).astype(x.dtype)
     counts = kernel.levels or (0,) * x.shape[0]
@@ -212,6 +227,7 @@ def _matern32(r: Float[Array, ""]) -> Float[Array, ""]:
 
 @_matern32.defjvp
 def _matern32_jvp(primals, tangents):
+    """Value of `_matern32` and its derivative along the tangent, from `_matern32_slope`; no 0 * inf at r = 0."""
     return _matern32(*primals), _matern32_slope(*primals) * tangents[0]
 
 
@@ -223,7 +239,9 @@ def _matern32_slope(r: Float[Array, ""]) -> Float[Array, ""]:
 
 @_matern32_slope.defjvp
 def _matern32_slope_jvp(primals, tangents):
-    """Second derivative of the correlation by r, exp(-s) / (4 s); taken as 0 at r = 0."""
+    """Value of `_matern32_slope` and its derivative along the tangent: exp(-s) / (4 s) times it, taken as 0 at r =
+    0.
+    """
     (r,) = primals
     apart = r > 0
     root = jnp.sqrt(jnp.where(apart, r, 1.0))

@@ -59,6 +59,7 @@ class Pointwise(eqx.Module):
     log_likelihood: Callable[[Vector], Vector]
 
     def __call__(self, eta: Vector) -> tuple[Vector, Vector, Vector]:
+        """Values, slopes and minus second derivatives of the terms at `eta` (n,), (n,) each."""
         ones = jnp.ones_like(eta)  # the terms are independent: one tangent serves them all
 
         def value_and_slope(eta):
@@ -76,9 +77,10 @@ def laplace(
     **Arguments:**
 
     - `covariance`: K, (n, n), symmetric, positive semi-definite. Terms that always return 0 (padding) change nothing.
-    - `terms`: eta (n,) -> values, slopes and curvatures, (n,) each; a pytree (an `eqx.Module`, say) if it holds
-      arrays that are traced. [`Pointwise`][] makes one from values alone.
-    - `start`: `weights` of an earlier, similar fit; changes the number of steps, not the result.
+    - `terms`: eta (n,) -> values, slopes and curvatures, (n,) each; a pytree (an `eqx.Module`, say) if it holds arrays
+      that are traced. [`Pointwise`][] makes one from values alone.
+    - `start`: `weights` (n,) of an earlier, similar fit (default: 0); changes the number of steps, not the result.
+    - `max_steps`: largest number of Newton steps of each search.
 
     **Returns:** a [`GaussianPosterior`][]; differentiable in `covariance` and in the arrays of `terms`. Never raises:
     read `certificate.converged`.
@@ -120,10 +122,12 @@ class Mode(NamedTuple):
 
 @eqx.filter_custom_jvp
 def find_mode(terms: Terms, covariance: Matrix, start: Vector, max_steps: int) -> Mode:
-    """Find the mode from weights `start`, or if that fails from 0.
+    """Find the mode of log p(data | eta) - eta'K^-1 eta / 2: by `plain_mode` from the weights `start`, with at most 20
+    steps; if that does not converge, by damped Newton steps in v from 0, with at most `max_steps`.
 
-    Under `vmap` the problems are solved one by one on CPUs, each stopping when it has converged; elsewhere all at once
-    in v. `covariance` (n, n), `start` (n,).
+    `covariance` K (n, n), `start` (n,). Never raises: the search converged if `residual <= tolerance`. Under `vmap` the
+    problems are solved one by one on CPUs, each stopping when it has converged; on other devices all at once by the
+    damped steps from 0, without `start`. Only `eta` is differentiable, in the arrays of `terms` and in `covariance`.
     """
     arrays, rest = eqx.partition(terms, eqx.is_array)
 
@@ -139,9 +143,10 @@ def find_mode(terms: Terms, covariance: Matrix, start: Vector, max_steps: int) -
 
 
 def plain_mode(terms: Terms, covariance: Matrix, start: Vector, max_steps: int) -> Mode:
-    """Find the mode by full Newton steps on the weights, as long as the log posterior rises.
+    """Search for the mode by full Newton steps on the weights from `start`, as long as the log posterior rises.
 
-    `covariance` (n, n), `start` (n,).
+    `covariance` (n, n), `start` (n,). Returns the last iterate, converged or not; its `changed` is 0, since no root of
+    K is used. No derivatives.
     """
     import optimistix as optx  # slow to import, and needed only where a fit is traced
 
@@ -154,7 +159,10 @@ def plain_mode(terms: Terms, covariance: Matrix, start: Vector, max_steps: int) 
 
 
 def _whitened_mode(terms: Terms, covariance: Matrix, start: Vector, max_steps: int) -> Mode:
-    """Find the mode by damped Newton steps in v, from the weights `start`."""
+    """Search for the mode by damped Newton steps in v, from the v that corresponds to the weights `start` (n,).
+
+    Returns the best iterate, converged or not.
+    """
     from hilbo.newton_steps import Whitened, climbed  # imports optimistix, which is slow
 
     root, changed = square_root(covariance)
@@ -164,7 +172,11 @@ def _whitened_mode(terms: Terms, covariance: Matrix, start: Vector, max_steps: i
 
 @find_mode.def_jvp
 def find_mode_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Mode, Mode]:
-    """Derivative of the mode: (I + K W) d eta = d(K grad l) at fixed eta, and (I + K W)^-1 = I - K C."""
+    """Result of `find_mode` and its tangents: (I + K W) d eta = d(K grad l) at fixed eta, with (I + K W)^-1 = I - K C.
+
+    `primals`, `tangents`: the arguments of `find_mode` and their tangents. Only `eta` has a tangent; the other fields
+    have None.
+    """
     terms, covariance, _, _ = primals
     mode = find_mode(*primals)
 
@@ -179,6 +191,6 @@ def find_mode_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> 
 
 
 def _stationarity(eta: Vector, args: tuple[Terms, Matrix]) -> Vector:
-    """eta - K grad l(eta), which is 0 at the mode."""
+    """eta - K grad l(eta), (n,), which is 0 at the mode; `args` are the terms and K."""
     terms, covariance = args
     return eta - covariance @ terms(eta)[1]

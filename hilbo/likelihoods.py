@@ -32,7 +32,9 @@ def __dir__() -> list[str]:
 
 
 def _rising(thresholds: np.ndarray) -> bool:
-    """Whether there is at least one threshold, and all are finite and increasing; over all participants."""
+    """Whether there is at least one threshold, and all are finite and increasing along the last axis, of all
+    participants.
+    """
     not_empty = thresholds.ndim > 0 and thresholds.shape[-1] > 0
     return bool(not_empty and np.all(np.isfinite(thresholds)) and np.all(np.diff(thresholds) > 0))
 
@@ -65,14 +67,14 @@ class OrdinalProbit(eqx.Module):
 
     @property
     def categories(self) -> int:
-        """Number C of categories."""
+        """Number C of categories: one more than thresholds."""
         return self.thresholds.shape[-1] + 1
 
     def log_prob(self, f: ArrayLike, q: ArrayLike) -> Float[Array, ""]:
         """log p(q | f) for one latent value `f` and one category `q` in 0..C-1.
 
-        Differentiable to any order in `f`, the thresholds and the noise; exact in both tails.
-        Both are scalars, and so is the result; `jax.vmap` for several.
+        Differentiable to any order in `f`, the thresholds and the noise; exact in both tails. Both are scalars, and so
+        is the result; `jax.vmap` for several. NaN for a category below 0.
         """
         f, lower, upper, noise = self._edges(f, q)
         return truncated_normal(f, lower, upper, noise).log_mass
@@ -80,7 +82,7 @@ class OrdinalProbit(eqx.Module):
     def expand(self, f: ArrayLike, q: ArrayLike) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
         """log p(q | f), its derivative in `f`, and minus its second derivative (in [0, 1 / noise^2]).
 
-        All are scalars; `jax.vmap` for several.
+        `f`, the category `q` in 0..C-1 and all results are scalars; `jax.vmap` for several. NaN for a category below 0.
         """
         f, lower, upper, noise = self._edges(f, q)
         truncated = truncated_normal(f, lower, upper, noise)
@@ -91,10 +93,10 @@ class OrdinalProbit(eqx.Module):
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
         """Log of the integral of p(q | f) over f ~ N(mean, variance), its derivative in `mean`, and site precision t.
 
-        t is the precision of the Gaussian site that gives that normal the variance of the tilted distribution. The
-        integral is the same likelihood with its noise grown to s, s^2 = noise^2 + variance; minus the second derivative
-        in `mean` is t / (1 + variance t). With k_2 the variance of the truncated normal, t = (1 - k_2) / (noise^2 +
-        variance k_2): never negative, at most 1 / noise^2.
+        All arguments and results are scalars. t is the precision of the Gaussian site that gives that normal the
+        variance of the tilted distribution. The integral is the same likelihood with its noise grown to s, s^2 =
+        noise^2 + variance; minus the second derivative in `mean` is t / (1 + variance t). With k_2 the variance of the
+        truncated normal, t = (1 - k_2) / (noise^2 + variance k_2): never negative, at most 1 / noise^2.
         """
         mean, lower, upper, noise = self._edges(mean, q)
         variance = jnp.asarray(variance, mean.dtype)
@@ -106,7 +108,8 @@ class OrdinalProbit(eqx.Module):
     def class_probabilities(self, mean: ArrayLike, variance: ArrayLike = 0.0) -> Float[Array, " categories"]:
         """Probabilities (C,) of the categories when f ~ N(mean, variance); they sum to 1 within rounding.
 
-        Paper, section VI: the noise grows to sqrt(noise^2 + variance), and the edges stay.
+        `mean` and `variance` are scalars. Paper, section VI: the noise grows to sqrt(noise^2 + variance), and the edges
+        stay. NaN for a noise that is not above 0.
         """
         mean, variance = floats(jnp.asarray(mean), self.thresholds.dtype), jnp.asarray(variance)
         spread = jnp.sqrt(self.noise**2 + variance.astype(self.noise.dtype))
@@ -116,10 +119,11 @@ class OrdinalProbit(eqx.Module):
     def _edges(
         self, f: ArrayLike, q: ArrayLike
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """`f`, the lower and upper edge of category `q` (infinite at the ends) and the noise, in the dtype of `f`.
+        """`f`, the lower and upper edge of category `q` (infinite at the ends) and the noise: scalars in the dtype of
+        `f`.
 
-        NaN for invalid thresholds or noise, and for a negative category. Raises `InputError` for arguments that are not
-        scalars.
+        For invalid thresholds or noise the returned noise is NaN, for a negative category the lower edge. Raises
+        `InputError` for arguments that are not scalars.
         """
         if jnp.ndim(f) or jnp.ndim(q) or jnp.ndim(self.noise) or jnp.ndim(self.thresholds) != 1:
             shapes = f"{jnp.shape(f)}, {jnp.shape(q)}, {jnp.shape(self.thresholds)} and {jnp.shape(self.noise)}"
@@ -138,7 +142,10 @@ class OrdinalProbit(eqx.Module):
 
 
 class OrdinalTerms(eqx.Module):
-    """Responses as log-likelihood terms with slopes and curvatures; 0 in rows without a response."""
+    """Responses as log-likelihood terms with slopes and curvatures.
+
+    `q` (n,): categories; `mask` (n,): False in rows without a response, whose terms are 0.
+    """
 
     likelihood: OrdinalProbit
     q: Int[Array, " n"]
@@ -146,13 +153,19 @@ class OrdinalTerms(eqx.Module):
 
     @traced_once
     def __call__(self, eta: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+        """log p(q_i | eta_i), its derivative, and minus its second derivative, at latent values `eta` (n,); (n,)
+        each.
+        """
         expansion = jax.vmap(self.likelihood.expand)(eta, self.q)
         value, slope, curvature = (jnp.where(self.mask, term, jnp.zeros_like(term)) for term in expansion)
         return value, slope, curvature
 
 
 class TiltedTerms(eqx.Module):
-    """Responses averaged over cavities, for expectation propagation: log integrals, slopes and site precisions."""
+    """Responses averaged over cavities, for expectation propagation: log integrals, slopes and site precisions.
+
+    `q` (n,): categories; `mask` (n,): False in rows without a response, whose terms are 0.
+    """
 
     likelihood: OrdinalProbit
     q: Int[Array, " n"]
@@ -162,6 +175,9 @@ class TiltedTerms(eqx.Module):
     def __call__(
         self, mean: Float[Array, " n"], variance: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+        """Log of the integral of p(q_i | f) over f ~ N(mean_i, variance_i), its derivative in the mean, and the site
+        precision (`OrdinalProbit.smoothed`); (n,) each.
+        """
         smoothed = jax.vmap(self.likelihood.smoothed)(mean, variance, self.q)
         value, slope, precision = (jnp.where(self.mask, term, jnp.zeros_like(term)) for term in smoothed)
         return value, slope, precision

@@ -35,7 +35,8 @@ class _FullState(eqx.Module):
 class FullNewton(optx.AbstractRootFinder):
     """Full Newton steps on the weights a, eta = K a, as long as the log posterior rises (R & W, algorithm 3.1).
 
-    `args` are the terms and K. One evaluation per iteration, the first of them at the start.
+    The function whose root is sought is ignored: `args` are the terms and K. One evaluation per iteration, the first of
+    them at the start.
     """
 
     rtol: float = 0.0
@@ -43,13 +44,16 @@ class FullNewton(optx.AbstractRootFinder):
     norm: Callable = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """Initial state, before any evaluation."""
+        """Initial state, before any evaluation: log posterior -inf, residual inf; arguments of optimistix."""
         del fn, args, options, f_struct, aux_struct, tags
         infinite = jnp.asarray(jnp.inf, y.dtype)
         return _FullState(y, -infinite, infinite, jnp.asarray(True))
 
     def step(self, fn, y, args, options, state, tags):
-        """Evaluate the weights `y` and take a full Newton step."""
+        """Evaluate log posterior and residual at the weights `y` (n,), and take a full Newton step from there.
+
+        Returns the next weights, the state with the values at `y`, and None (no auxiliary output).
+        """
         del fn, options, tags
         terms, covariance = args
         eta = covariance @ y
@@ -65,22 +69,27 @@ class FullNewton(optx.AbstractRootFinder):
         return following, _FullState(eta, objective, residual, objective >= state.objective - slack), None
 
     def terminate(self, fn, y, args, options, state, tags):
-        """Whether the residual is below the tolerance, or the log posterior has stopped rising."""
+        """Whether the last evaluated residual is at most the tolerance, or the log posterior did not rise; and the
+        result code, which is always success: the caller has to compare the residual.
+        """
         del fn, args, options, tags
         return ~(state.risen & (state.residual > self.tolerance(y.dtype))), optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Return the weights and the auxiliary output unchanged, and no statistics."""
         del fn, args, options, state, tags, result
         return y, aux, {}
 
     @staticmethod
     def tolerance(dtype: DTypeLike) -> Scalar:
-        """Tolerance of the residual, in standard deviations of the prior."""
+        """Tolerance of the residual in this dtype, in standard deviations of the prior: eps^(2/3). A scalar."""
         return residual_tolerance(jnp.zeros((), dtype))
 
 
 class Height(eqx.Module):
-    """The log posterior at a point, and how far the point is from the mode."""
+    """Log posterior at a point, its rounding error, a bound on the distance to the mode (`residual`, in standard
+    deviations of the prior), and the tolerance of that residual; scalars.
+    """
 
     objective: Scalar
     rounding: Scalar
@@ -93,14 +102,17 @@ class Height(eqx.Module):
 
 @runtime_checkable
 class Ascent(Protocol):
-    """A concave log posterior in coordinates of some shape, in which Newton's steps are taken."""
+    """Interface of a concave log posterior in coordinates of any shape, which `DampedNewton` maximises."""
 
     def at(self, point: Array, /) -> tuple[Height, PyTree]:
-        """Its height at a point, and what else is known there."""
+        """Height at a point, and intermediate results at that point, which are passed to `towards`."""
         ...
 
     def towards(self, point: Array, known: PyTree, /) -> tuple[Array, Scalar]:
-        """Newton's step from a point, and the rate of ascent along it."""
+        """Newton step from a point, of the point's shape, and the slope of the log posterior along it.
+
+        `known`: the second result of `at` for that point.
+        """
         ...
 
 
@@ -117,7 +129,7 @@ class DampedNewton(optx.AbstractRootFinder):
     """Newton steps damped by Armijo's rule; one evaluation per iteration, the first of them at the start.
 
     A step is accepted if the log posterior rose by a fraction of the increase predicted by the slope (beyond its own
-    rounding), else its scale is halved. `args` is an `Ascent`.
+    rounding), else its scale is halved. `args` is an `Ascent`; the function whose root is sought is ignored.
     """
 
     rtol: float = 0.0
@@ -125,14 +137,19 @@ class DampedNewton(optx.AbstractRootFinder):
     norm: Callable = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """Initial state, before any evaluation."""
+        """Initial state, before any evaluation: height -inf, residual inf, a step of 0; arguments of optimistix."""
         del fn, args, options, f_struct, aux_struct, tags
         infinite = jnp.asarray(jnp.inf, y.dtype)
         zero, one = jnp.zeros_like(infinite), jnp.ones_like(infinite)
         return _Search(Height(-infinite, zero, infinite, zero), jnp.zeros_like(y), one, zero)
 
     def step(self, fn, y, args, options, state, tags):
-        """Evaluate the planned point; accept it, or halve the step."""
+        """Evaluate the point one scaled step from the best point `y`. If the height rose enough, that point becomes the
+        best one and its Newton step the next; else the scale of the step is halved.
+
+        Returns the best point, the state, and None. A start whose height is NaN makes the scale 0, which ends the
+        search.
+        """
         del fn, options, tags
         trial = y + state.scale * state.direction
         reached, known = args.at(trial)
@@ -150,24 +167,31 @@ class DampedNewton(optx.AbstractRootFinder):
         return y, _Search(height, direction, scale, gain), None
 
     def terminate(self, fn, y, args, options, state, tags):
-        """Whether the residual is below its tolerance, or the step has become negligible."""
+        """Whether the residual of the best point is at most its tolerance, or the scale of the step is below 1e-12; and
+        the result code, which is always success.
+        """
         del fn, y, args, options, tags
         ended = (state.height.residual <= state.height.tolerance) | (state.scale < 1e-12)
         return ended, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Return the best point and the auxiliary output unchanged, and no statistics."""
         del fn, args, options, state, tags, result
         return y, aux, {}
 
 
 def climbed(ascent: Ascent, start: Array, max_steps: int) -> tuple[Array, Height, Int[Array, ""]]:
-    """Where the damped steps from `start` end, the height there, and how many were tried, the start among them."""
+    """Maximise `ascent` from the point `start` by damped Newton steps.
+
+    Returns the best point, of the shape of `start`, its height, and the number of evaluations, the start included.
+    Never raises: after `max_steps` evaluations the residual may be above its tolerance.
+    """
     solution = optx.root_find(_same, DampedNewton(), start, ascent, max_steps=max_steps, throw=False)
     return solution.value, solution.state.height, jnp.asarray(solution.stats["num_steps"], jnp.int32)
 
 
 def _same(point: Array, ascent: Ascent) -> Array:
-    """The solver looks at the ascent alone."""
+    """Return `point`. Optimistix needs a function for its root finder; `DampedNewton` ignores it."""
     del ascent
     return point
 
@@ -179,7 +203,9 @@ class Whitened(eqx.Module):
     root: Matrix
 
     def at(self, v: Vector) -> tuple[Height, tuple[Vector, Vector]]:
-        """The height at `v`, and the slope and the curvature there."""
+        """Height at `v` (n,); and the gradient R'grad l - v (n,) of the log posterior and the curvatures W (n,)
+        there.
+        """
         root = self.root
         values, slope, curvature = self.terms(root @ v)
         uphill = root.T @ slope - v
@@ -196,7 +222,7 @@ class Whitened(eqx.Module):
         return height, (uphill, curvature)
 
     def towards(self, v: Vector, known: tuple[Vector, Vector]) -> tuple[Vector, Scalar]:
-        """By the Cholesky factor of I + R'WR."""
+        """Newton step (I + R'WR)^-1 gradient from a point, (n,), and the slope along it; `known` as from `at`."""
         uphill, curvature = known
         root = self.root
         newton_matrix = jnp.eye(v.shape[0], dtype=v.dtype) + (root.T * curvature[None, :]) @ root

@@ -70,7 +70,11 @@ class OrdinalGP(eqx.Module):
 
 
 class Posterior(eqx.Module):
-    """Posterior of the latent function of one participant; the result of [`fit`][]."""
+    """Posterior of the latent function of one participant; the result of [`fit`][].
+
+    `gp` and `trials` are those of the fit; `latent` is the posterior of the latent values at the tested points. Under
+    `vmap` the arrays have a leading axis of participants; the methods are for one.
+    """
 
     gp: OrdinalGP
     trials: Trials
@@ -78,31 +82,36 @@ class Posterior(eqx.Module):
 
     @property
     def log_evidence(self) -> Scalar:
-        """Approximate log p(responses). A scalar, in nats."""
+        """Log marginal likelihood log p(responses), approximate or sampled. A scalar, in nats."""
         return self.latent.log_evidence
 
     @property
     def certificate(self) -> Certificate | SamplingCertificate:
-        """Convergence diagnostics of this fit; standard errors if it is sampled."""
+        """Convergence diagnostics of this fit; Monte Carlo standard errors if it is sampled."""
         return self.latent.certificate
 
     def mean(self, x: _PointsLike) -> Float[Array, " m"]:
-        """Posterior mean (m,) of f at points (m, d) of the unit cube, without computing the variance."""
+        """Posterior mean (m,) of f at points (m, d) of the unit cube, without computing the variance.
+
+        Raises `InputError` for points of another shape or not finite; warns of points outside the cube. So do the
+        methods below.
+        """
         return _mean(self, self._points(x))
 
     def predict(self, x: _PointsLike) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Posterior mean and variance of f, (m,) each, at points (m, d) of the unit cube."""
+        """Posterior mean and variance of f, (m,) each, at points (m, d) of the unit cube; errors as `mean`."""
         return _predict(self, self._points(x))
 
     def predict_explained(self, x: _PointsLike) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Posterior mean, and the part of the prior variance that the responses explain, without cancellation.
+        """Posterior mean (m,) of f, and the explained variance (m,): prior minus posterior variance, without
+        cancellation.
 
-        `x` (m, d) in the unit cube -> (m,), (m,).
+        `x`: points (m, d) of the unit cube; errors as `mean`.
         """
         return _mean_and_explained(self, self._points(x))
 
     def astype(self, dtype: DTypeLike) -> "Posterior":
-        """Posterior converted to another float dtype.
+        """Copy with all floating-point arrays converted to another float dtype.
 
         Screening many points in float32 costs half as much, with an error of about 1e-6 of the prior's standard
         deviation.
@@ -113,7 +122,7 @@ class Posterior(eqx.Module):
         """Predicted probabilities (m, C) of the response categories at points (m, d) of the unit cube.
 
         From mean and variance, assuming a normal f; after `inference="exact"` from the samples themselves. Raises
-        `InputError` for points of another shape.
+        `InputError` for points of another shape or not finite.
         """
         if isinstance(self.latent, ExactPosterior):
             return _sampled_probabilities(self, self._points(x))[0]
@@ -123,9 +132,10 @@ class Posterior(eqx.Module):
     def standard_errors(
         self, x: _PointsLike
     ) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, "m categories"]]:
-        """Monte Carlo standard errors of mean (m,), variance (m,) and class probabilities (m, C) of an exact posterior.
+        """Monte Carlo standard errors of mean (m,), variance (m,) and class probabilities (m, C) at points (m, d),
+        after `inference="exact"`.
 
-        Raises `InputError` for a posterior of another inference, and for points of another shape than (m, d).
+        Raises `InputError` for a posterior of another inference, and for points of another shape or not finite.
         """
         latent, x = _sampled(self, "standard_errors"), self._points(x)
         mean, variance = latent.moment_errors(gram(self.gp.kernel, self.trials.x, x))
@@ -134,12 +144,17 @@ class Posterior(eqx.Module):
     def draw(self, key: PRNGKeyArray, x: _PointsLike, count: int) -> Float[Array, "count m"]:
         """Independent draws (count, m) of the latent function from the exact posterior, jointly at all points (m, d).
 
-        Raises `InputError` for a posterior of another inference, and for points of another shape.
+        All NaN if the search for the tilting of the sampler did not converge. Raises `InputError` for a posterior of
+        another inference, and for points of another shape or not finite.
         """
         return _draw(self, key, self._points(x), count)
 
     def _points(self, x: _PointsLike) -> Float[Array, "m d"]:
-        """Points as an array. Raises `InputError` for another shape than (m, d), and for values that are not finite."""
+        """Points (m, d) as an array: floating-point JAX arrays keep their dtype, others take that of the trials.
+
+        Raises `InputError` for another shape, for values that are not finite, and for a posterior of several
+        participants; warns of points outside the unit cube. Traced values are not checked.
+        """
         dtype = self.trials.x.dtype
         points = floats(x, dtype) if isinstance(x, jax.Array) else numbers("Posterior", "x", x, dtype)
         if self.trials.x.ndim != 2:
@@ -170,13 +185,15 @@ class Posterior(eqx.Module):
 
 @functools.partial(jax.jit, static_argnames="count")
 def _draw(posterior: Posterior, key: PRNGKeyArray, x: Float[Array, "m d"], count: int) -> Float[Array, "{count} m"]:
-    """Draw from an exact posterior."""
+    """Compiled part of `Posterior.draw`: draws (count, m). Raises `InputError` for a posterior that is not sampled."""
     kernel, latent = posterior.gp.kernel, _sampled(posterior, "draw")
     return latent.draw(key, gram(kernel, posterior.trials.x, x), gram(kernel, x, x), count)
 
 
 def _sampled(posterior: Posterior, wanted: str) -> ExactPosterior:
-    """Latent posterior if it is sampled, else raise `InputError`; `wanted` is the calling method."""
+    """Return `posterior.latent` if it is sampled, else raise `InputError`; `wanted`: the calling method, for the
+    message.
+    """
     if not isinstance(posterior.latent, ExactPosterior):
         raise InputError(f'Posterior.{wanted}: this posterior is not sampled; fit with inference="exact".')
     return posterior.latent
@@ -186,7 +203,10 @@ def _sampled(posterior: Posterior, wanted: str) -> ExactPosterior:
 def _sampled_probabilities(
     posterior: Posterior, x: Float[Array, "m d"]
 ) -> tuple[Float[Array, "m categories"], Float[Array, "m categories"]]:
-    """Class probabilities (m, C) and their standard errors, point by point."""
+    """Class probabilities (m, C) and their standard errors (m, C), one point after the other.
+
+    Raises `InputError` for a posterior that is not sampled.
+    """
     latent = _sampled(posterior, "class_probabilities")
 
     def one(point):
@@ -199,20 +219,20 @@ def _sampled_probabilities(
 
 @jax.jit
 def _mean(posterior: Posterior, x: Float[Array, "m d"]) -> Float[Array, " m"]:
-    """Posterior mean (m,)."""
+    """Compiled part of `Posterior.mean`: posterior mean (m,)."""
     return gram(posterior.gp.kernel, x, posterior.trials.x) @ posterior.latent.weights
 
 
 @jax.jit
 def _predict(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Posterior mean and variance, (m,) each."""
+    """Compiled part of `Posterior.predict`: posterior mean and variance, (m,) each."""
     mean, explained = _mean_and_explained(posterior, x)
     return mean, jax.vmap(posterior.gp.kernel.diagonal)(x) - explained
 
 
 @jax.jit
 def _mean_and_explained(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Posterior mean and explained variance, (m,) each, computed in parts."""
+    """Posterior mean and explained variance, (m,) each, computed in at most 8 parts of the points."""
     latent, count = posterior.latent, x.shape[0]
     # Parts keep the covariances in a core's cache; a scan would drop derivative rules. The transposition makes each
     # coordinate contiguous, for vectorised loops over points.
@@ -264,14 +284,17 @@ def fit(
 
 
 def _without_padding(trials: Trials) -> Trials:
-    """Trials with rows without a response set to 0, since 0 times NaN is NaN, in values and in derivatives."""
+    """Copy of the trials with point and category of rows without a response set to 0; mask and context are kept.
+
+    Padding may be NaN, and 0 times NaN is NaN, in values and in derivatives.
+    """
     x = jnp.where(trials.mask[:, None], trials.x, 0)
     return Trials(x, jnp.where(trials.mask, trials.q, 0), trials.mask, trials.context)
 
 
 @functools.partial(jax.jit, static_argnames="inference")
 def _fit(gp: OrdinalGP, trials: Trials, start: Vector | None, inference: str) -> Posterior:
-    """Compiled part of `fit`."""
+    """Compiled part of `fit`: the posterior by the given `inference`, converged or not; nothing is checked."""
     trials = _without_padding(trials)
     covariance = gram(gp.kernel, trials.x, trials.x)
     if inference in ("ep", "ep_corrected"):
@@ -284,7 +307,9 @@ def _fit(gp: OrdinalGP, trials: Trials, start: Vector | None, inference: str) ->
 
 
 def _exact_latent(likelihood: OrdinalProbit, trials: Trials, covariance: Matrix) -> ExactPosterior:
-    """Exact posterior by sampling, with the same samples in every fit."""
+    """Posterior of the latent values at the trials by sampling; `covariance` K (n, n). The random key is fixed, so that
+    every fit has the same samples.
+    """
     ends = jnp.full((1,), jnp.inf, covariance.dtype)
     edges = jnp.concatenate([-ends, likelihood.thresholds.astype(covariance.dtype), ends])
     noise = likelihood.noise.astype(covariance.dtype)
@@ -292,7 +317,11 @@ def _exact_latent(likelihood: OrdinalProbit, trials: Trials, covariance: Matrix)
 
 
 def _checked(posterior: Posterior, sought: str) -> Posterior:
-    """Return the posterior; raise `InferenceError` (under `jit` an equinox error) if it has not converged."""
+    """Return the posterior if it has converged, else raise `InferenceError` (under `jit` an equinox error).
+
+    A point that is not finite, or a response outside the categories, raises `InputError` instead. `sought`: what was
+    searched for, for the message.
+    """
     certificate = posterior.certificate
     if isinstance(certificate.converged, jax.core.Tracer):
         message = f"the {sought} was not found to its tolerance; fit with throw=False and read the certificate"

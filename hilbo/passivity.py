@@ -126,7 +126,8 @@ def is_passive(
     """Whether the rendering is passive on a device with damping `b` (N·s/m), elementwise.
 
     For every delay of the force from 0 to `delay` (s), as checked by a device. The needed damping first falls with the
-    delay and then rises, so that checking both ends is sufficient.
+    delay and then rises, so that checking both ends is sufficient. Raises `InputError` for even N, and for values out
+    of range; where these are traced the result is False.
     """
     arguments = K1, B1, alpha, K_eff, N, T
     passive = minimum_damping(*arguments, memory=memory) <= jnp.asarray(b)
@@ -136,9 +137,11 @@ def is_passive(
 
 
 def largest_K1_beside(model: FOSLS, b: float, *, delay: float = 0.0) -> float:
-    """`largest_K1` (N/mm) for the B1, α, memory, T and static stiffness of a model.
+    """`largest_K1` (N/mm) for the B1, α, memory, T and static stiffness H(1) of a model, on damping `b` (N·s/m).
 
-    Computed by NumPy if the model's numbers are NumPy's and there is no `delay`. Raises `InputError` for even N.
+    The model's own K1 enters only through H(1). `inf` where every K1 is passive, 0 where none is. Computed by NumPy if
+    the model's numbers are NumPy's and there is no `delay` (s). Raises `InputError` for even N, and for values out of
+    range.
     """
     arguments = model.B1, model.alpha, b, model.dc_gain(), model.T
     if check_delay(delay, model.T):
@@ -149,14 +152,16 @@ def largest_K1_beside(model: FOSLS, b: float, *, delay: float = 0.0) -> float:
 
 
 def _checked_span(memory: Memory, N: int) -> Span:
-    """Memory of a model. Raises `InputError` for even N, for which the closed forms do not hold."""
+    """Memory as a `Span`. Raises `InputError` for short memory of even N, for which the closed forms do not hold."""
     if memory == "short" and N % 2 == 0:
         raise InputError(f"N is {N}; it must be odd: the closed passivity bound is too low for an even number of taps.")
     return span(memory, N)
 
 
 def _minimum_damping(span: Span, K1: Scalar, B1: Scalar, alpha: Scalar, K_eff: Scalar, T: Scalar) -> Scalar:
-    """b_min of the module docstring, N·s/m; 500·T is T/2 for stiffness in N/mm."""
+    """b_min of the module docstring, N·s/m, for scalars; inf for a negative `K_eff`. 500·T is T/2 for stiffness in
+    N/mm.
+    """
     beta = pot_stiffness(B1, alpha, T)
     gl = sums(alpha, span)
     fast, slow = share(K1, beta * gl.at_nyquist), share(K1, beta * gl.at_dc)
@@ -165,7 +170,10 @@ def _minimum_damping(span: Span, K1: Scalar, B1: Scalar, alpha: Scalar, K_eff: S
 
 
 def _largest_K1(span: Span, B1: Number, alpha: Number, b: Number, K_eff: Number, T: Number) -> Number:
-    """K1max of the module docstring, N/mm, including its limits 0 and inf."""
+    """K1max of the module docstring, N/mm, for scalars: 0 where no K1 is passive, inf where every K1 is.
+
+    NumPy numbers give a NumPy number, others a JAX array.
+    """
     xp = namespace_of(B1, alpha, b, K_eff, T)
     beta = pot_stiffness(B1, alpha, T)
     gl = sums(alpha, span)

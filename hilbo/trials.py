@@ -27,7 +27,7 @@ _BLOCK = 32  # default capacities are multiples of this, so that growing data ra
 
 
 def _floats(x: Any) -> Any:
-    """Points as floating-point numbers; other pytree leaves unchanged."""
+    """Array with integers and booleans converted to the default float type; other objects unchanged."""
     return floats(x) if isinstance(x, jax.Array | np.ndarray) else x
 
 
@@ -77,22 +77,22 @@ class Trials(eqx.Module):
 
     @classmethod
     def empty(cls, capacity: int, dim: int) -> "Trials":
-        """Trials without responses, with room for `capacity` of them."""
+        """Trials without responses, with room for `capacity` of them at points of `dim` coordinates. Raises as
+        `from_arrays`.
+        """
         return cls.from_arrays(np.zeros((0, dim)), np.zeros(0, int), capacity)
 
     @property
     def capacity(self) -> int:
-        """Number of rows."""
+        """Number of rows, with and without a response."""
         return self.x.shape[-2]
 
     def append(self, x: ArrayLike | Sequence[float], q: ArrayLike) -> "Trials":
-        """Trials with one more response in the first free row; shapes stay the same, so nothing recompiles.
+        """Copy with one more response in the first row without one; shapes stay the same, so nothing recompiles.
 
-        Contexts are dropped.
-
-        `x` (d,) in the unit cube, `q` a category in 0..C-1. Raises `InputError` for a point of another shape, values
-        that are not finite, an invalid category, trials of several participants, and a full table; where these are
-        traced, x becomes NaN.
+        `x` (d,) in the unit cube, `q` a category in 0..C-1. The copy has no contexts. Raises `InputError` for a point
+        of another shape, values that are not finite, an invalid category, trials of several participants, and a full
+        table. Traced values are not checked; if a full table is traced, all x become NaN.
         """
         if self.mask.ndim != 1:
             raise InputError(f"Trials: holds {len(self.mask)} people; append to the answers of one, or use jax.vmap.")
@@ -113,13 +113,16 @@ class Trials(eqx.Module):
         )
 
     def first(self, count: ArrayLike) -> "Trials":
-        """Trials with only the first `count` rows, at the same capacity. `count`: an int, from 0 to the capacity."""
+        """Copy in which only the first `count` rows may hold a response: the mask is False from row `count` on.
+
+        Points, categories and capacity stay. `count`: an int, from 0 to the capacity, may be traced.
+        """
         keep = jnp.arange(self.capacity) < count
         return Trials(self.x, self.q, self.mask & keep, self.context)
 
 
 def _array(name: str, value: Any) -> np.ndarray:
-    """Value as a NumPy array. Raises `InputError` for rows of different lengths."""
+    """Value as a NumPy array; `name` is for the error. Raises `InputError` for rows of different lengths."""
     try:
         return np.asarray(value)
     except ValueError:
@@ -128,7 +131,9 @@ def _array(name: str, value: Any) -> np.ndarray:
 
 
 def _check_points(points: np.ndarray) -> None:
-    """Raise `InputError` for points that are not float32, float64 or integers, and for points without coordinates."""
+    """Raise `InputError` for points that are not float32, float64, integers or booleans, and for points without
+    coordinates.
+    """
     kind, size = points.dtype.kind, points.dtype.itemsize
     if kind not in "biu" and (kind, size) not in {("f", 4), ("f", 8)}:
         raise InputError(f"Trials: x is of type {points.dtype}; give numbers, as float32 or float64.")
@@ -137,7 +142,9 @@ def _check_points(points: np.ndarray) -> None:
 
 
 def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:
-    """Raise `InputError` for shapes that do not match, values that are not finite, and invalid categories."""
+    """Raise `InputError` unless points are (n, d) and categories (n,), the points are finite, and the categories valid
+    (`_check_categories`).
+    """
     if points.ndim != 2 or answers.ndim != 1 or len(points) != len(answers):
         raise InputError(
             f"Trials: x has shape {points.shape} and q has shape {answers.shape}; give x as (n, d) and q as (n,)."

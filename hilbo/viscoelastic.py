@@ -71,12 +71,15 @@ def __dir__() -> list[str]:
 
 
 def gl_sum(alpha: Reals, N: int) -> Float[Array, "..."]:
-    """S_N = C(1) = Π_{i=1..N} (1 - α/i), elementwise in `alpha`."""
+    """S_N = C(1) = Π_{i=1..N} (1 - α/i), elementwise in `alpha`. Raises `InputError` for values out of range."""
     return elementwise(_gl_sum, span("short", N), alpha)
 
 
 def gl_alternating_sum(alpha: Reals, N: int) -> Float[Array, "..."]:
-    """C(-1) = Σ (-1)^i c_i, elementwise in `alpha`; within 3.4e-4 of 2^α at N = 101."""
+    """C(-1) = Σ (-1)^i c_i, elementwise in `alpha`; within 3.4e-4 of 2^α at N = 101.
+
+    Raises `InputError` for values out of range.
+    """
     return elementwise(_gl_alternating_sum, span("short", N), alpha)
 
 
@@ -94,22 +97,31 @@ def K0_from_effective_stiffness(
 def dc_gain(
     K0: Reals, K1: Reals, B1: Reals, alpha: Reals, N: int = 101, T: Reals = 1e-3, *, memory: Memory = "short"
 ) -> Float[Array, "..."]:
-    """Static stiffness H(1) (N/mm) of the sampled model; elementwise."""
+    """Static stiffness H(1) (N/mm) of the sampled model; elementwise.
+
+    K0 and K1 in N/mm, B1 in N·s^α/mm, T in s. Raises `InputError` for values out of range; where these are traced the
+    result is NaN.
+    """
     return elementwise(_dc_gain, span(memory, N), K0, K1, B1, alpha, T)
 
 
 def effective_damping(
     K1: Reals, B1: Reals, alpha: Reals, N: int = 101, T: Reals = 1e-3, *, memory: Memory = "short", states: int = 10
 ) -> Float[Array, "..."]:
-    """Damping dH/ds at s = 0 (N·s/m), that of slow motion, T·K1²·β·M1/(K1 + β·S_N)²; elementwise."""
+    """Damping dH/ds at s = 0 (N·s/m), that of slow motion, T·K1²·β·M1/(K1 + β·S_N)²; elementwise.
+
+    K1 in N/mm, B1 in N·s^α/mm, T in s; `states`: number of exponentials of full memory. Raises `InputError` for values
+    out of range; where these are traced the result is NaN.
+    """
     return elementwise(_effective_damping, span(memory, N, states), K1, B1, alpha, T)
 
 
 def elementwise(function: Callable, span: Span, *args: Reals, batch: int | None = None) -> Float[Array, "..."]:
-    """Apply `function(span, *scalars)` over broadcast arguments in their common floating dtype, compiled once.
+    """Apply `function(span, *scalars)` over the broadcast arguments `args`, converted to their common floating dtype.
 
-    `batch`: elements computed at a time, if one takes much memory. Arguments named in `RANGES` are checked: raises
-    `InputError` for values out of range; where these are traced, the result is NaN.
+    Compiled once for each function, span and shapes. `batch`: number of elements computed at a time, to limit memory;
+    None: all. Arguments whose parameter name is in `RANGES` are checked, except K0: raises `InputError` for values out
+    of range; where these are traced, the result is NaN.
     """
     names = _ranged(function)
     check_ranges(**{name: args[i] for i, name in names})
@@ -119,7 +131,9 @@ def elementwise(function: Callable, span: Span, *args: Reals, batch: int | None 
 
 @cache
 def _ranged(function: Callable) -> tuple[tuple[int, str], ...]:
-    """Positions (after `span`) and names of the parameters that have a range; K0 may be any number here."""
+    """Positions (after `span`) and names of a function's parameters that have a range in `RANGES`, without K0, which
+    may be any number here.
+    """
     names = [*signature(function).parameters][1:]
     return tuple((i, name) for i, name in enumerate(names) if name in RANGES and name != "K0")
 
@@ -128,7 +142,7 @@ def _ranged(function: Callable) -> tuple[tuple[int, str], ...]:
 def _compiled(
     function: Callable, span: Span, *args: Float[Array, "..."], batch: int | None = None
 ) -> Float[Array, "..."]:
-    """Compiled part of `elementwise`."""
+    """Compiled part of `elementwise`; NaN where an argument is out of range."""
 
     def one(*scalars):
         allowed = possible(**{name: scalars[i] for i, name in _ranged(function)})
@@ -154,7 +168,7 @@ def _gl_alternating_sum(span: Span, alpha: Scalar) -> Scalar:
 
 
 def _K0(span: Span, K1: Scalar, B1: Scalar, alpha: Scalar, K_eff: Scalar, T: Scalar) -> Scalar:
-    """K0 (N/mm) for one parameter set."""
+    """K0 (N/mm) with which one parameter set has the static stiffness `K_eff` (N/mm)."""
     return K_eff - slow_stiffness(K1, pot_stiffness(B1, alpha, T), sums(alpha, span))
 
 
