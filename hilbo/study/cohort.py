@@ -1,4 +1,5 @@
-"""The answers of a study's participants, padded to one capacity: from a trial table to what a batch of fits takes."""
+"""The responses of a study's participants, padded to one capacity: conversion of a trial table to the arrays that a
+batched fit takes."""
 
 import dataclasses
 import os
@@ -28,13 +29,14 @@ __all__ = ["Cohort", "cohort_of", "read_trials"]
 
 _LEVELS = 200  # of a random effect
 _CATEGORIES = "hilbo's column category"
-"""Of a DataFrame's attributes, the one that tells the column that `read_trials` added from one of the user's own."""
+"""Attribute of a DataFrame whose column `category` was added by `read_trials`."""
 
 
 class Cohort(eqx.Module):
-    """The answers of M participants, padded to one capacity.
+    """The responses of M participants, padded to one capacity (the number of slots per participant).
 
-    `trials` is stacked, (M, capacity, ...); `physical` (M, capacity, d) holds the same points as tables do.
+    `trials` is stacked, (M, capacity, ...), with a mask of the slots in use; `physical` (M, capacity, d) holds the same
+    points in physical units (levels by index), NaN in unused slots. `names`: participants' ids.
     """
 
     trials: Trials
@@ -43,13 +45,15 @@ class Cohort(eqx.Module):
     contexts: tuple[str, ...] = eqx.field(static=True, default=())
     """Levels of the study's random effect, in the order of `trials.context`."""
     numbers: np.ndarray | None = None
-    """The table's trial number of each answer (M, capacity), 0 where there is none; None of no table."""
+    """Trial number of each response in the table (M, capacity), 0 in unused slots; None without a table."""
     session: np.ndarray | None = None
-    """The place in `sessions` of each answer's session (M, capacity), where the table has that column,"""
+    """Index in `sessions` of each response's session (M, capacity); None if the table has no such column."""
     sessions: tuple[str, ...] = eqx.field(static=True, default=())
-    """and their names."""
+    """Names of the sessions."""
 
     def __repr__(self) -> str:
+        """Counts of participants, responses and parameters, with the first six ids; the field structure while JAX
+        traces."""
         if not has_values(self.trials.x, self.trials.mask):
             return eqx.tree_pformat(self)
         few = ", ".join(self.names[:6]) + (", ..." if len(self.names) > 6 else "")
@@ -57,14 +61,16 @@ class Cohort(eqx.Module):
         return f"Cohort({len(self.names)} participants ({few}), {answers} answers, {dim} parameters)"
 
     def first(self, count: int) -> "Cohort":
-        """Only everybody's first `count` trials. Raises `InputError` for fewer than one."""
+        """Copy of the cohort in which only each participant's first `count` responses are unmasked; capacity and
+        `physical` are unchanged. Raises `InputError` for fewer than one."""
         if count < 1:
             raise InputError(f"Cohort: asked for everybody's first {count} trials; give a number from 1.")
         mask = np.asarray(self.trials.mask) & (np.arange(self.trials.mask.shape[1]) < count)[None, :]
         return dataclasses.replace(self, trials=eqx.tree_at(lambda t: t.mask, self.trials, to_device(mask)))
 
     def of(self, names: Sequence[str]) -> "Cohort":
-        """Only these participants. Raises `InputError` for a name that the table does not have, or that comes twice."""
+        """Sub-cohort of these participants (ids, or one id), in the order given. Raises `InputError` for an id that is
+        not in the cohort, or given twice."""
         names = [names] if isinstance(names, str) else list(names)
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
@@ -79,14 +85,14 @@ class Cohort(eqx.Module):
         return self.rows(np.array([places[name] for name in names]))
 
     def rows(self, rows: Int[np.ndarray, " k"]) -> "Cohort":
-        """Only the participants in these places. `rows` (k,): numbers from 0."""
+        """Sub-cohort by row. `rows` (k,): row numbers from 0, in the order wanted."""
         names = tuple(self.names[row] for row in rows)
         numbers, session = (None if held is None else held[rows] for held in (self.numbers, self.session))
         of_rows = rows_of(self.trials, rows), self.physical[rows], names
         return Cohort(*of_rows, self.contexts, numbers, session, self.sessions)
 
     def counts(self) -> Int[np.ndarray, " M"]:
-        """Answers of each participant. (M,)."""
+        """Number of unmasked responses of each participant. (M,)."""
         return np.asarray(self.trials.mask).sum(axis=1)
 
 
@@ -99,14 +105,16 @@ def read_trials(
     say: Callable[[int], None] = lambda rows: None,
     note: Callable[[str], object] = warn_caller,
 ) -> pd.DataFrame:
-    """The rows of a trial table that are to be fitted, in the order of their keys within each participant.
+    """Read and check a trial table; returns the rows to be fitted, sorted by participant, session and trial.
 
-    Adds the column `category` (0 = lowest response); of a level its place in the list stands in its parameter's column.
-    Warm-up, repeated and voided rows are checked and left out, and so are those with a flag that the study excludes.
+    Adds the column `category` (0 = lowest response); a parameter with levels gets the index of the level (from 0) in
+    place of its name. Warm-up, repeated and voided rows, and those with a flag that the study excludes, are checked and
+    left out.
 
-    **Arguments:** `path`: a CSV or Parquet file. `material`: only its rows; needed if there are several. `others`: keep
-    the columns that hilbo does not use. `say`: called with the number of rows read so far. `note`: called with a
-    sentence on participants without a response that counts; by default a warning. Raises `InputError`.
+    **Arguments:** `path`: a CSV or Parquet file. `material`: select its rows; required if the table has several.
+    `others`: keep the columns that hilbo does not use. `say`: called with the number of rows read so far. `note`:
+    called with one sentence on participants none of whose responses is fitted, and one on ids that differ in capitals
+    only; by default a warning. Raises `InputError`.
     """
     cells = cell_pieces(path)
     table = trial_table(cells, study.file, material, source=str(path), others=others, say=say, note=note)
@@ -115,11 +123,11 @@ def read_trials(
 
 
 def cohort_of(table: TrialTable | pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:
-    """The participants of a trial table: one that was checked against this study, or a DataFrame with its columns,
-    such as `read_trials` makes, which is checked as a file is.
+    """The cohort of a trial table: a checked `TrialTable`, or a DataFrame with the columns of a trial table, such as
+    `read_trials` returns, which is checked as a file is.
 
     `capacity` defaults to the study's number of trials, or to the most responses of a participant if that is more.
-    Raises `InputError` for a table that is none of the study's, and a `capacity` that somebody's responses exceed.
+    Raises `InputError` for an invalid table, and for a `capacity` smaller than a participant's number of responses.
     """
     answers = (table if isinstance(table, TrialTable) else _checked(table, study)).rows
     person, names = pd.factorize(answers["participant"])
@@ -152,7 +160,11 @@ def cohort_of(table: TrialTable | pd.DataFrame, study: Study, capacity: int | No
 def _asked(
     table: pd.DataFrame, rows: tuple[np.ndarray, np.ndarray], shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    """Trial numbers and sessions of a table's rows, which go to these places, and the names of the sessions."""
+    """Arrays of trial numbers and session indices, both of `shape` (0 in unused slots), and the session names in index
+    order.
+
+    `rows`: participant index and slot of each row of `table`. Without a column "session": None and ().
+    """
     numbers, session = np.zeros(shape, np.int64), np.zeros(shape, np.int32)
     numbers[rows] = table["trial"].to_numpy(int)
     if "session" not in table:
@@ -162,8 +174,9 @@ def _asked(
 
 
 def _checked(table: pd.DataFrame, study: Study) -> TrialTable:
-    """A DataFrame checked as a file is. In one that `read_trials` made levels are places in the list, which become
-    their names; no level's name is a number, so that nothing is mistaken. And categories may stand for responses."""
+    """Convert a DataFrame to text cells and check it as a file is. Two columns that `read_trials` makes are converted
+    back: level indices become level names, and `category` gives the response where that column is missing. If
+    `read_trials` made the table and it has both, they must agree. Raises InputError."""
     text = cells_of(table)
     for p in study.space.parameters:
         if p.levels and p.name in table and pd.api.types.is_numeric_dtype(table[p.name]):
@@ -179,8 +192,9 @@ def _checked(table: pd.DataFrame, study: Study) -> TrialTable:
 
 
 def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:
-    """Each row's level of the study's random effect; None where the study names none or all are of one level. Raises
-    InputError where a rule that learns misses the column, and where there are too many levels to be some."""
+    """Text of each row in the column of the study's random effect, (n,); None if the study specifies none, if all rows
+    have one level, or if the column is missing and the method does not learn the effect. Raises InputError if the
+    column is missing with a method that does, or if there are more than 200 levels."""
     column = study.file.random_effect
     if column is None or (column not in table and not RULES[study.rule].learns):
         return None
@@ -201,5 +215,6 @@ def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:
 
 @program
 def _to_unit(space: SearchSpace, physical: Float[ArrayLike, "M n d"]) -> Float[Array, "M n d"]:
-    """Person by person, as `session.ask_tell.physical_trials` does for one: the same bits."""
+    """Physical values mapped to the unit cube, participant by participant; bit-identical to
+    `session.ask_tell.physical_trials`."""
     return jax.lax.map(space.to_unit, jnp.asarray(physical))

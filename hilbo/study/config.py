@@ -1,4 +1,4 @@
-"""The Study record: a study file with its model and its search space, ready to be computed with."""
+"""The Study record: a checked study file together with its model and its search space."""
 
 import os
 from collections.abc import Mapping
@@ -21,9 +21,9 @@ __all__ = ["RBF", "OrdinalGP", "OrdinalProbit", "Study"]
 
 
 class Study(eqx.Module):
-    """A study file with its search space and its model, ready to be computed with.
+    """A checked study file with its search space and its model.
 
-    `gp` holds arrays and may be differentiated; all else but `learnt` is static.
+    `gp` holds arrays and may be differentiated; all other fields but `learnt` are static.
     """
 
     gp: OrdinalGP
@@ -31,24 +31,26 @@ class Study(eqx.Module):
     file: StudyFile = eqx.field(static=True)
     """All that the study file contains: responses, selection, texts and so on."""
     rule: str = eqx.field(static=True)
-    """The method that aggregates participants: the file's, or one to compare with it."""
+    """Name of the aggregation method: the file's, or one to compare with it."""
     inference: Inference = eqx.field(static=True)
     stated: Stated = eqx.field(static=True, repr=False, default=NOTHING)
-    """What the file specifies of the model, where the method learns the rest; and of levels, whatever the method."""
+    """Hyperparameters that the file specifies, for a method that learns the others; levels for any method."""
     learnt: Learnt | None = eqx.field(repr=False, default=None)
-    """What was learnt from the responses, by a method that learns; `gp` is then the learnt model, and before that the
-    priors' medians."""
+    """Result of learning the hyperparameters from the responses, for a method that learns; `gp` is then the learnt
+    model, and before that the priors' medians."""
 
     @staticmethod
     def load(path: str | os.PathLike) -> "Study":
-        """Read and check a study file; InputError says in one sentence what is wrong with it, and where."""
+        """Read a study file and build its study; the overrides of every material are checked too. Raises InputError:
+        one sentence with the file, the line where known, the mistake and its remedy."""
         if not isinstance(path, str | os.PathLike):
             raise InputError(f"Study: the path is a {type(path).__name__}; give the path of a study file, as text.")
         return read_study(path, Study.of)
 
     @staticmethod
     def from_dict(raw: Mapping[str, Any], source: str = "") -> "Study":
-        """As `load`, from the parsed tables; numbers and lists may be NumPy's. Raises InputError as `load` does."""
+        """As `load`, from the tables of a parsed study file; numbers and lists may be NumPy's. `source`: path for error
+        messages. Raises InputError as `load` does."""
         if not isinstance(raw, Mapping):
             raise InputError(f"Study: this is a {type(raw).__name__}; give a study file's tables, or Study.load(path).")
         return checked(_plain(raw), source, Study.of)
@@ -56,12 +58,14 @@ class Study(eqx.Module):
     @staticmethod
     @lru_cache(maxsize=32)
     def of(file: StudyFile) -> "Study":
-        """The study of a file. Raises InputError if nothing in its box is passive."""
+        """The study of a checked file, without its materials' overrides; the last 32 are cached. Raises InputError if
+        the model cannot be built or no point of the search space is feasible."""
         gp, stated = _gp(file)
         space = SearchSpace(file.space.parameters, file.space.mechanics, file.space.constraints)
         return Study(gp, space, file, file.rule, file.gp.inference, stated)
 
     def __repr__(self) -> str:
+        """One line: name, parameter ranges, response labels, aggregation method and hash."""
         ranges = ", ".join(
             f"{p.name} {p.range_words}" if p.levels else f"{p.name} {p.low:g} to {p.high:g} {p.unit}".rstrip()
             for p in self.space.parameters
@@ -75,12 +79,14 @@ class Study(eqx.Module):
         return self.file.responses
 
     def material(self, name: str) -> "Study":
-        """The study of one material: its overrides of [renderer] and [parameters] applied. Raises `InputError`."""
+        """The study of one material: its overrides of [renderer] and [parameters] applied. Raises `InputError` for a
+        name that is not in [materials]."""
         return Study.of(self.file.material(name))
 
 
 def _plain(raw: Any) -> Any:
-    """With Python's own numbers, lists and dicts in place of NumPy's and other mappings."""
+    """Copy of nested tables in which NumPy scalars and arrays, tuples and other mappings are Python numbers, lists and
+    dicts."""
     if isinstance(raw, Mapping):
         return {key: _plain(value) for key, value in raw.items()}
     if isinstance(raw, list | tuple):
@@ -89,7 +95,9 @@ def _plain(raw: Any) -> Any:
 
 
 def _gp(file: StudyFile) -> tuple[OrdinalGP, Stated]:
-    """The model of [gp], and what the file states of it; a rule that learns takes the priors' medians for the rest."""
+    """The model of [gp] and the hyperparameters that the file specifies. For a method that learns, the model has the
+    prior's median for each hyperparameter that is not specified; for other methods only levels are recorded as
+    specified."""
     table, parameters = file.gp, file.space.parameters
     numbers = sum(not p.levels for p in parameters)
     levels = tuple(Levels(p.steps, p.correlation) if p.levels else None for p in parameters)

@@ -1,5 +1,5 @@
-"""How a study's sessions depart from the plan that was made before them: people, answers, the study file, and by which
-plan each session was held."""
+"""Deviations of a study's sessions from their plan: participants, numbers of responses, study file, and the plan that
+each session followed."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -9,16 +9,16 @@ from hilbo.study.file.plan_file import Plan
 __all__ = ["PHASE", "Held", "departures"]
 
 PHASE = "optimisation"
-"""Of the sessions that are compared with their plan."""
+"""Phase whose sessions are compared with their plan."""
 
 
 class Held(NamedTuple):
-    """By which plan a session was held."""
+    """A session and the plan that it followed."""
 
     participant: str
     session: str
     plan: str
-    """Its hash; empty where it was held by none."""
+    """Hash of the plan; empty if the session had none."""
 
 
 def departures(
@@ -28,11 +28,15 @@ def departures(
     counts: Mapping[str, Sequence[int]],
     sessions: Sequence[Held] | None = None,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What departs from the plan, in sentences; and what is as planned, if nothing does.
+    """Compare sessions with their plan; returns (deviations, confirmation), each a tuple of sentences, of which one is
+    empty.
 
-    **Arguments:** `study_hash`: of the study file of these answers; `trials`: that each person was to answer for each
-    material; `counts`: person -> number of answers for each material; `sessions`: those of this phase, None where
-    nothing says by which plan they were held.
+    The second has one sentence if there is no deviation. A plan of another phase than `PHASE` is compared with nothing
+    and gives one sentence in the first.
+
+    **Arguments:** `study_hash`: of the study file of these responses; `trials`: planned number per participant and
+    material; `counts`: participant -> number of responses for each material; `sessions`: the sessions of this phase
+    with their plans, None if not known.
     """
     if plan.phase != PHASE:
         return (f"plan.json is a plan of {plan.phase}, so that these answers are compared with no plan.",), ()
@@ -66,7 +70,8 @@ def departures(
 
 
 def _held_otherwise(plan: Plan, sessions: Sequence[Held]) -> list[str]:
-    """Sentences on the sessions that were held by no plan, or by another."""
+    """Up to two sentences: sessions without a plan, and sessions under a plan other than this one or those it
+    replaces."""
     own = (plan.hash, *plan.replaces)
     none = [f"{held.participant} (session {held.session})" for held in sessions if not held.plan]
     other = [

@@ -1,4 +1,4 @@
-"""Who is left out of an analysis: the study's rule, applied to people's own answers before they are aggregated."""
+"""Exclusion of participants: the study's rule, applied to each participant's response quality before aggregation."""
 
 from typing import NamedTuple
 
@@ -13,17 +13,18 @@ __all__ = ["Included", "exclusion_sentences", "included"]
 
 
 class Included(NamedTuple):
-    """Whose answers are aggregated."""
+    """Participants that are aggregated, and those excluded."""
 
     cohort: Cohort
     people: pd.DataFrame
-    """Everybody's measures (`response_quality.measure_people`), those left out too."""
+    """Response quality of all participants (`response_quality.measure_people`), also of those excluded."""
     left_out: dict[str, str]
-    """Who was left out, and why."""
+    """Excluded participant -> reason."""
 
 
 def included(study: Study, everybody: Cohort) -> Included:
-    """The cohort without those whom the study's rule leaves out. Raises `InputError` if it leaves nobody."""
+    """Apply the study's exclusion rule to a cohort; computes the response quality of every participant. Raises
+    `InputError` if nobody is left."""
     people = measure_people(study.gp, everybody.trials, everybody.names)
     left_out = excluded(people, study.file.exclude)
     if len(left_out) == len(everybody.names):
@@ -36,7 +37,8 @@ def included(study: Study, everybody: Cohort) -> Included:
 
 
 def exclusion_sentences(study: Study, left_out: dict[str, str]) -> list[str]:
-    """Who was left out by [study] exclude, in a sentence; nothing where nobody was."""
+    """One sentence that lists the excluded participants with the reason (`left_out`: id -> reason), or an empty
+    list."""
     if not left_out:
         return []
     who = "; ".join(f"{name} ({why.partition(', and')[0]})" for name, why in left_out.items())

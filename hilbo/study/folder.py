@@ -1,14 +1,15 @@
-"""A folder to report: study file, trial tables, and what there is of validation and sets tables.
+"""The folder of `hilbo report`: study file, trial tables, and optional validation and sets tables.
 
     study.toml        the study file
-    trials*.csv       one or several trial tables (or .parquet); a column `material` tells materials apart
+    trials*.csv       one or several trial tables (or .parquet); a column `material` distinguishes materials
     validation*.csv   optional: validation tables
-    sets*.csv         optional: sets tables; a set of source "sysid" is what tables and figures are held against
-    truth.csv         optional, of a simulated study: `source` "population" and the parameters that are the truth
-    plan.json         optional: the plan of `hilbo plan`, from which the answers may depart
+    sets*.csv         optional: sets tables; a set of source "sysid" is the reference of tables and figures
+    truth.csv         optional, of a simulated study: the true parameters, in a row of `source` "population"
+    plan.json         optional: the plan of `hilbo plan`, with which the sessions are compared
+
 The folder of `hilbo export` is one: its data/ holds trials, validation, sets, and sessions (for the plan) by the names
 of a Psych-DS. A study of several materials names them in [materials.NAME] (which overrides the renderer or parameters)
-or in the tables' column `material` alone, when they share everything. Whatever is wrong is one sentence with its file.
+or in the tables' column `material` alone, when they share everything. Every mistake is one sentence with its file.
 """
 
 import json
@@ -36,7 +37,7 @@ __all__ = ["Material", "StudyFolder", "read_folder"]
 
 
 class Material(NamedTuple):
-    """One material's part of a folder."""
+    """The data of one material in a folder."""
 
     name: str
     """Empty if the study has one material without a name."""
@@ -44,28 +45,30 @@ class Material(NamedTuple):
     cohort: Cohort
     validation: pd.DataFrame | None
     reference: Float[np.ndarray, " d"] | None
-    """The system-identification set, or the truth of a simulated study, in the unit cube; where it lies in the box."""
+    """System-identification set, or truth of a simulated study, in the unit cube; None if there is none."""
     reference_name: str
     flags: FlagCounts = FlagCounts()
-    """Trials that carry a flag of the device, and those that are left out for it."""
+    """Counts of trials with a flag of the device, and of those excluded for it."""
 
 
 class StudyFolder(NamedTuple):
-    """A folder, read and checked."""
+    """The checked content of a folder."""
 
     study: Study
     materials: list[Material]
     sets: pd.DataFrame | None
     limits: tuple[str, ...]
-    """What these tables cannot say, and what departs from the plan."""
+    """Sentences: deviations from the plan, and information that the tables lack."""
     notes: tuple[str, ...] = ()
-    """What is as it was planned, and the flags of comparisons."""
+    """Sentences: confirmation of the plan, and flags of comparisons."""
 
 
 def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
-    """Read everything in a folder; `exclude`: a rule in place of the study file's own.
+    """Read and check all files of a folder. `exclude`: exclusion rule that replaces the study file's; None keeps that
+    one.
 
-    Raises `InputError` for what is wrong or missing.
+    Raises `InputError` for a missing or invalid file. Warns about trial tables without a response to fit, and leaves
+    them out.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; hilbo report wants one with study.toml and trials.csv.")
@@ -97,7 +100,7 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
 
 
 def _with_exclusion(study: Study, exclude: str | None) -> Study:
-    """The study with another rule of exclusion."""
+    """The study with another exclusion rule, rebuilt and checked; the same study for None."""
     if exclude is None:
         return study
     content = {"schema": 1} | json.loads(study.file.content)
@@ -106,7 +109,8 @@ def _with_exclusion(study: Study, exclude: str | None) -> Study:
 
 
 def _table_paths(folder: Path, stem: str) -> list[Path]:
-    """Files STEM.csv and STEM-*.csv, or .parquet, and the table of an export."""
+    """Sorted paths of STEM.csv, STEM-*.csv and the same as .parquet, then those of an export's data/. Empty if there
+    are none."""
     paths = [
         p
         for p in folder.iterdir()
@@ -116,7 +120,8 @@ def _table_paths(folder: Path, stem: str) -> list[Path]:
 
 
 def _sets(paths: list[Path], study: Study) -> pd.DataFrame | None:
-    """All sets tables as one: to those of an export somebody adds what was identified."""
+    """All sets tables as one DataFrame indexed by `set_id`, missing texts as ""; None without tables. Raises InputError
+    for a `set_id` in two tables."""
     if not paths:
         return None
     whole = pd.concat([sets_frame(path, study.space.names, study.space.parameters) for path in paths])
@@ -128,6 +133,7 @@ def _sets(paths: list[Path], study: Study) -> pd.DataFrame | None:
 
 
 def _validation(path: Path, study: Study) -> pd.DataFrame:
+    """Read and check one validation table. Raises InputError."""
     return check_validation(
         read_cells(path, "a validation table needs a header and a comparison"),
         study.responses,
@@ -137,12 +143,13 @@ def _validation(path: Path, study: Study) -> pd.DataFrame:
 
 
 def _materials_named(pieces: Iterable[pd.DataFrame]) -> list[str]:
-    """Materials of a table's rows; [""] if it has no such column."""
+    """Different materials in the rows of a table's pieces, in their order; [""] if it has no column `material`."""
     return list(dict.fromkeys(name for cells in pieces for name in cells.get("material", [""])))
 
 
 def _material_names(study: Study, tables: Mapping[Path, list[pd.DataFrame]]) -> list[str]:
-    """Materials in the study's order, then in that of the tables; [""] if none is named anywhere."""
+    """Materials named in the tables: those of the study file first, in its order; [""] if none is named anywhere.
+    Raises InputError if only some rows name one, or for a name that is not in [materials]."""
     named = [name for pieces in tables.values() for name in _materials_named(pieces)]
     first = next(iter(tables))
     ordered = [name for name in study.file.materials if name in named] + [
@@ -158,12 +165,13 @@ def _material_names(study: Study, tables: Mapping[Path, list[pd.DataFrame]]) -> 
 
 
 def _rows_of_source(table: pd.DataFrame | None, source: str) -> pd.DataFrame | None:
-    """A sets table's rows of one source."""
+    """Rows of a table whose `source` is this; None for no table."""
     return None if table is None else table[table["source"] == source]
 
 
 def _check_materials_named(names: list[str], tables: Mapping[Path, pd.DataFrame | None]) -> None:
-    """Every row of these tables must name its material where there are several, or where another row does."""
+    """Raise InputError for a table with rows without a material, if the study has several or other rows of that table
+    name one. None and empty tables pass."""
     for path, table in tables.items():
         if table is None or table.empty or ("material" not in table and len(names) == 1):
             continue
@@ -180,7 +188,7 @@ def _material(
     sets: pd.DataFrame | None,
     truth: pd.DataFrame | None,
 ) -> Material:
-    """One material's rows of all tables, and its reference."""
+    """One material's data: its cohort, its comparisons (None if none), and its reference. Raises InputError."""
     material_study = study.material(name) if name in study.file.materials else study
     table = _answers(name, material_study, tables)
     _check_answers_once(table.rows, next(iter(tables)))
@@ -193,7 +201,8 @@ def _material(
 
 
 def _answers(name: str, study: Study, tables: Mapping[Path, list[pd.DataFrame]]) -> TrialTable:
-    """A material's answers in all tables. Somebody who stopped in the warm-up may have a table without any."""
+    """A material's responses of all trial tables as one. A table without a response to fit is left out with a warning;
+    if all are such, NothingToFitError is raised."""
     read, empty = [], []
     for path, pieces in tables.items():
         if name in _materials_named(pieces):
@@ -209,7 +218,8 @@ def _answers(name: str, study: Study, tables: Mapping[Path, list[pd.DataFrame]])
 
 
 def _check_answers_once(table: pd.DataFrame, path: Path) -> None:
-    """Several tables must not hold the same answer twice. A column that one of them lacks tells no answers apart."""
+    """Raise InputError if a response occurs twice in the joined tables. Rows are compared by those of participant,
+    session, phase and trial that no row lacks."""
     known = table.notna().all()
     key = [column for column in ("participant", "session", "phase", "trial") if column in table and known[column]]
     again = table.duplicated(key)
@@ -221,7 +231,8 @@ def _check_answers_once(table: pd.DataFrame, path: Path) -> None:
 
 
 def _read_truth(path: Path, study: Study) -> pd.DataFrame:
-    """The table of truth of a simulated study, its parameters as numbers."""
+    """Read truth.csv: `source`, the parameters as numbers (levels by index), and `material` if there is one. Raises
+    InputError."""
     cells = read_cells(path, "a table of truth needs a header and a row")
     check_texts(cells, str(path), study.space.names)
     missing = [name for name in ("source", *study.space.names) if name not in cells]
@@ -241,7 +252,9 @@ def _read_truth(path: Path, study: Study) -> pd.DataFrame:
 def _reference(
     study: Study, name: str, sets: pd.DataFrame | None, truth: pd.DataFrame | None
 ) -> tuple[Float[np.ndarray, " d"] | None, str]:
-    """What the optimum is held against: the sets table's system identification, else the simulation's truth."""
+    """Reference point (d,) in the unit cube and its name: the sets table's system identification, otherwise the
+    simulation's truth. (None, "") if neither has exactly one row with finite numbers. Raises InputError for several
+    rows of one material."""
     for table, source, words in ((sets, "sysid", "system identification"), (truth, "population", "the truth")):
         rows = _rows_of_source(table, source)
         if rows is None:
@@ -259,7 +272,8 @@ def _reference(
 
 
 def _departures(folder: Path, study: Study, materials: list[Material]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """How the answers depart from the folder's plan, and what is as planned; nothing where there is no plan."""
+    """Compare the sessions with plan.json; returns (deviations, confirmation) as `departures.departures` does. ((), ())
+    without a plan. Responses excluded for their flags are counted too."""
     path = folder / "plan.json"
     if not path.exists():
         return (), ()
@@ -272,7 +286,8 @@ def _departures(folder: Path, study: Study, materials: list[Material]) -> tuple[
 
 
 def _held(folder: Path) -> list[Held] | None:
-    """By which plans the sessions of an export were held; None where there is no table of sessions."""
+    """Sessions of the optimisation phase with the plan that each followed, read from an export's data/; None if there
+    is no table of sessions. Raises InputError."""
     paths = sorted((folder / "data").glob("*_table-sessions_data.csv"))
     held = []
     for path in paths:
@@ -288,7 +303,7 @@ def _held(folder: Path) -> list[Held] | None:
 def _missing_tables(
     study: Study, materials: list[Material], compared: pd.DataFrame | None, sets: pd.DataFrame | None
 ) -> tuple[str, ...]:
-    """What the folder's tables cannot say, in sentences."""
+    """Sentences about materials, validation and sets that the folder's tables do not have."""
     sentences = []
     if study.file.materials and materials[0].name == "":
         sentences.append("The tables name no material; they are read by the study's own, and none of [materials].")

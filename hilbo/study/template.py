@@ -1,4 +1,4 @@
-"""A commented study file to begin with, made of a few words; what is written is read again and checked."""
+"""Text of a new, commented study file from a few settings; the text is parsed and checked before it is returned."""
 
 import json
 import re
@@ -31,8 +31,8 @@ _FORM = "NAME=LOW:HIGH, NAME=LOW:HIGH:UNIT, NAME=LOW:HIGH:UNIT:log (or :integer)
 
 
 class NewStudy(NamedTuple):
-    """What is known of a study before it has a file. `device`: our device renders; else `by` presents, a program or a
-    person."""
+    """Settings of a study before it has a file. `device`: stimuli are rendered by the hilbo haptic device, with its
+    fixed parameters; otherwise they are presented `by` a program or a person."""
 
     name: str
     parameters: tuple[Parameter, ...]
@@ -45,7 +45,8 @@ class NewStudy(NamedTuple):
 
 
 def parameter_of(text: str) -> Parameter:
-    """A parameter as it is written on the command line. Raises InputError."""
+    """Parse a parameter of the command line: NAME=LOW:HIGH[:UNIT[:linear|log|integer]], or NAME=LEVEL,LEVEL,… for
+    unordered levels. Raises InputError."""
     name, equals, rest = text.partition("=")
     if equals and name.strip() and name.isprintable() and ":" not in rest and "," in rest:
         return Parameter.of_levels(name.strip(), tuple(level.strip() for level in rest.split(",")))
@@ -65,7 +66,8 @@ def parameter_of(text: str) -> Parameter:
 
 
 def study_text(new: NewStudy) -> str:
-    """The file's text. Raises InputError for what no study file may say."""
+    """Text of the study file, in TOML; nothing is written to disk. Raises InputError for settings that make no valid
+    study."""
     parameters = _parameters(new)
     constraints = [constraint_of(words, [p.name for p in parameters]) for words in new.constraints]
     text = _template().render(
@@ -90,20 +92,21 @@ def study_text(new: NewStudy) -> str:
 
 
 def _computed(file: StudyFile) -> None:
-    """Refuses constraints that leave nothing."""
+    """Build the study, to raise InputError if the constraints leave no feasible point."""
     from hilbo.study.config import Study  # loads what computes, which a file without constraints does not need
 
     Study.of(file)
 
 
 def _as_written(sentence: str, constraints: Sequence[str]) -> str:
-    """A sentence on the tables of constraints, on what stands on the command line for them."""
+    """An error sentence in which each key `constraints.N` is replaced by the --constraint option that it came from."""
     return re.sub(
         r"constraints\.(\d+)(\.terms)?", lambda m: f"--constraint {_quoted(constraints[int(m[1]) - 1])}", sentence
     )
 
 
 def _template() -> Template:
+    """The Jinja template `study.toml` of hilbo.study, with its filters."""
     environment = Environment(
         loader=PackageLoader("hilbo.study"),
         undefined=StrictUndefined,
@@ -116,15 +119,17 @@ def _template() -> Template:
 
 
 def _noted(text: str, comment: str) -> str:
-    """A line with a comment, in one column where it fits."""
+    """A line of TOML followed by a comment, which starts at column 37 where the line is short enough."""
     return f"{text:<36} # {comment}"
 
 
 def _checked(_file: StudyFile) -> None:
-    """Nothing more than that it is one."""
+    """Accept any file: `reading.checked` has done the checks that need no model."""
 
 
 def _parameters(new: NewStudy) -> Sequence[Parameter]:
+    """The parameters of the new study; the device's own for `device`. Raises InputError if `device` is combined with
+    parameters, if there are none, or if a name is repeated."""
     if new.device:
         if new.parameters:
             raise InputError("--parameter: the device renders K1, B1 and alpha; leave it out, or --device.")
@@ -139,7 +144,8 @@ def _parameters(new: NewStudy) -> Sequence[Parameter]:
 
 
 def _tolerances(parameters: Sequence[Parameter], part: int) -> str:
-    """Tolerances: that part of each range, or of the value on a logarithmic scale."""
+    """Inline TOML table of the presentation tolerance of each numeric parameter: range / `part`, and 1 / `part`
+    (relative) on a logarithmic scale, which a comment says."""
     tolerances = {p.name: (1 if p.scale == "log" else p.high - p.low) / part for p in parameters if not p.levels}
     logs = " and ".join(_quoted(p.name) for p in parameters if p.scale == "log")
     shares = f"  # of {logs} a share of the value, the scale is logarithmic" if logs else ""
@@ -147,8 +153,10 @@ def _tolerances(parameters: Sequence[Parameter], part: int) -> str:
 
 
 def _key(name: str) -> str:
+    """A TOML key, quoted unless it is a bare key."""
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _quoted(name)
 
 
 def _quoted(text: str) -> str:
+    """Text as a quoted TOML string (JSON syntax)."""
     return json.dumps(text, ensure_ascii=False)

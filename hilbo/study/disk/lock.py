@@ -1,8 +1,9 @@
 """Locks of the operating system, which end with the process that holds them: on an open file, and on a folder.
 
 A folder is locked by a file in it, `.hilbo.lock`, which is removed with the lock. Every command that reads a shared
-file, changes it and writes it again does so under the lock of the file's folder. A withdrawal keeps its journal in the
-folder that it was given, and as long as the journal is there, no folder below is locked by another command.
+file, changes it and writes it back does so under the lock of the file's folder. A withdrawal of a participant keeps a
+journal in the folder that it works on; while the journal exists, other commands can lock neither that folder nor one
+below it.
 """
 
 import contextlib
@@ -22,7 +23,8 @@ _PAUSE = 0.01  # s
 
 
 def lock(file: int, path: Path) -> None:
-    """Lock an open file, at once. Raises InputError if another holds it."""
+    """Lock an open file (a descriptor) exclusively, without waiting; `path` is for the message. Raises InputError if
+    another process holds the lock."""
     try:
         if os.name == "nt":
             import msvcrt
@@ -38,8 +40,12 @@ def lock(file: int, path: Path) -> None:
 
 
 def held(path: Path, flags: int = os.O_CREAT) -> int | None:
-    """A file opened and locked, for its owner alone where it is new; None if another holds it, or removed it meanwhile.
-    A link is not followed. Raises OSError."""
+    """Open and lock a file; returns its descriptor, or None if another process holds the lock or has removed the file
+    meanwhile.
+
+    `flags` are added to O_RDWR; by default a missing file is created, readable by its owner only. Symbolic links are
+    not followed. Raises OSError.
+    """
     file = os.open(path, os.O_RDWR | flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0), 0o600)
     try:
         lock(file, path)
@@ -52,14 +58,18 @@ def held(path: Path, flags: int = os.O_CREAT) -> int | None:
 
 
 def withdrawal_above(folder: Path) -> Path | None:
-    """The folder, of this one and those above it, in which a withdrawal is going on or was interrupted."""
+    """The innermost of this folder and its parents that has the journal of a running or interrupted withdrawal; None if
+    none."""
     return next((place for place in (folder, *folder.parents) if (place / JOURNAL).exists()), None)
 
 
 @contextlib.contextmanager
 def locked_folder(folder: Path, patience: float = _PATIENCE, *, in_withdrawal: bool = False) -> Iterator[None]:
-    """Hold the lock of a folder. `in_withdrawal`: although a withdrawal's journal is there. Raises InputError if the
-    folder is not free within `patience` (s), or cannot be written to."""
+    """Context manager that holds the lock of a folder. `in_withdrawal`: ignore a withdrawal's journal.
+
+    Retries until `patience` (s) is over, then raises InputError if the folder is still locked or in a withdrawal; also
+    raises it if the lock file cannot be opened.
+    """
     folder, deadline = Path(os.path.realpath(folder)), time.monotonic() + patience
     path = folder / LOCK
     while True:
@@ -87,6 +97,7 @@ def locked_folder(folder: Path, patience: float = _PATIENCE, *, in_withdrawal: b
 
 
 def _release(file: int, path: Path) -> None:
+    """Remove the lock file and close its descriptor, which ends the lock."""
     with contextlib.suppress(OSError):  # Windows removes no open file; the next one to lock it finds it there
         path.unlink()
     os.close(file)

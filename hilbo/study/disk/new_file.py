@@ -1,7 +1,7 @@
-"""A file that is written beside its place, forced to the disk, and put there whole.
+"""Atomic writing of a file: a temporary file in the same folder is written, synced to disk, and renamed.
 
-What is being written has a random name that no other process can have made (`.hilbo-….part`), is its owner's alone to
-read, and is locked, so that what a killed process left behind is known and removed.
+The temporary file has a random name (`.hilbo-….part`), is readable by its owner only, and is locked while it is
+written, so that leftovers of killed processes can be recognised and removed.
 """
 
 import contextlib
@@ -23,8 +23,13 @@ _NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.E
 
 @contextlib.contextmanager
 def new_file(path: Path, *, replace: bool, mode: int = _OWNER_ONLY) -> Iterator[Path]:
-    """A path beside `path` to write to, which takes its place when the block ends well; a link there is replaced, not
-    followed. Without `replace` raises FileExistsError where something has the name by then. Raises OSError."""
+    """Context manager that gives the path of a temporary file; on success it is synced and becomes `path`, on an
+    exception it is deleted and `path` is unchanged.
+
+    `replace`: overwrite an existing file; a symbolic link is replaced, not followed. Otherwise raises FileExistsError,
+    at the end, if `path` exists by then. `mode`: permissions of the file. Also removes leftovers of killed processes
+    from the folder. Raises OSError.
+    """
     remove_unfinished(path.parent)
     unfinished, file = _begun(path.parent)
     try:
@@ -45,20 +50,22 @@ def new_file(path: Path, *, replace: bool, mode: int = _OWNER_ONLY) -> Iterator[
 
 
 def write_file(path: Path, content: str | bytes, *, replace: bool, mode: int = _OWNER_ONLY) -> None:
-    """Write a whole file, as `new_file` does; text in UTF-8. Raises OSError."""
+    """Write a whole file atomically, as `new_file` does; text in UTF-8. Raises OSError, FileExistsError without
+    `replace`."""
     with new_file(path, replace=replace, mode=mode) as unfinished:
         unfinished.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def rewrite_file(path: Path, content: str | bytes) -> None:
-    """Replace what a file holds; its rights stay. For a file that several write, under the lock of its folder. Raises
-    OSError."""
+    """Replace a file's content atomically and keep its permissions; a missing file is created for its owner only. The
+    caller holds the lock of the folder. Raises OSError."""
     mode = stat.S_IMODE(path.stat().st_mode) if path.exists() else _OWNER_ONLY
     write_file(path, content, replace=True, mode=mode)
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what killed processes were writing in a folder."""
+    """Delete the temporary files of `new_file` in a folder that no process has locked. Files that cannot be opened or
+    deleted stay, without an error."""
     for path in folder.glob(UNFINISHED):
         with contextlib.suppress(OSError):  # its writer was done just now, or is another user
             if (file := held(path, 0)) is not None:
@@ -67,7 +74,8 @@ def remove_unfinished(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Force the names in a folder to the disk; where folders cannot be opened, the system sees to that."""
+    """Sync a folder's entries to disk (fsync); does nothing where the system cannot open folders. Raises OSError if the
+    sync fails."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:
@@ -79,6 +87,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def _begun(folder: Path) -> tuple[Path, int]:
+    """Create and lock a temporary file with a new random name; returns its path and descriptor."""
     while True:
         path = folder / UNFINISHED.replace("*", secrets.token_hex(8))
         if (file := held(path, os.O_CREAT | os.O_EXCL)) is not None:
@@ -86,6 +95,8 @@ def _begun(folder: Path) -> tuple[Path, int]:
 
 
 def _put(unfinished: Path, path: Path, replace: bool) -> None:
+    """Move the finished temporary file to `path`. Without `replace` raises FileExistsError if `path` exists, also on
+    disks without hard links."""
     if not replace:
         try:
             os.link(unfinished, path)

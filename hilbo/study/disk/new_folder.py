@@ -1,7 +1,9 @@
-"""A folder that is filled beside its place and put there whole; the one that it replaces is set aside until then.
+"""Atomic writing of a folder: a temporary folder next to it is filled and renamed; an existing one is moved aside until
+then.
 
-`.NAME-….part` is being filled, and locked by the process that does so; `.NAME-….old` is set aside. What a killed
-process left of both is dealt with by whoever makes a folder there next, and by a withdrawal.
+`.NAME-….part` is the folder being filled, locked by the process that fills it; `.NAME-….old` is the previous one, moved
+aside. Leftovers of killed processes are recovered or removed by the next process that makes a folder there, and by a
+withdrawal.
 """
 
 import contextlib
@@ -20,14 +22,18 @@ from hilbo.study.disk.new_file import sync_folder
 __all__ = ["LEFTOVER", "new_folder", "recover"]
 
 LEFTOVER = re.compile(r"\.(.+)-[0-9a-f]{8}\.(part|old)")
-"""The name of a folder that is not finished, or set aside."""
+"""Pattern of the names of folders that are unfinished, or moved aside."""
 
 
 @contextlib.contextmanager
 def new_folder(out: Path, check: Callable[[], None]) -> Iterator[Path]:
-    """A folder to fill, which becomes `out` when the block ends well; all in it is its owner's alone. `check` raises
-    InputError where `out` may not be replaced; what came there meanwhile stays, and the new folder gets another name.
-    Raises InputError and OSError."""
+    """Context manager that gives an empty temporary folder; on success it becomes `out`, on an exception it is deleted.
+
+    Its files and folders are made accessible to their owner only and synced. `check` raises InputError if `out` may not
+    be replaced; it is called before and after the block. If it fails after, `out` stays, the new folder becomes `OUT-2`
+    (or the next free number), and InputError says so. Raises InputError for a folder that cannot be written, locked, or
+    is in a withdrawal, and OSError.
+    """
     try:
         made, filling = _begun(out, check)
     except OSError as error:
@@ -49,8 +55,9 @@ def new_folder(out: Path, check: Callable[[], None]) -> Iterator[Path]:
 
 
 def recover(folder: Path) -> list[Path]:
-    """Deal with what killed processes left in a folder, whose lock is held: old ones come back where no new one is in
-    their place, all else is removed. Returns the folders that are still being filled. Raises OSError."""
+    """Clean up leftovers of killed processes in a folder, whose lock the caller holds: a folder moved aside is restored
+    if its place is empty, otherwise deleted; unfinished ones are deleted. Returns the temporary folders that are still
+    being filled. Raises OSError."""
     filled = []
     for path in sorted(path for path in folder.iterdir() if LEFTOVER.fullmatch(path.name)):
         name, kind = LEFTOVER.fullmatch(path.name).groups()  # type: ignore[union-attr]
@@ -64,7 +71,8 @@ def recover(folder: Path) -> list[Path]:
 
 
 def _begun(out: Path, check: Callable[[], None]) -> tuple[Path, int]:
-    """The folder to fill, and the lock that says so."""
+    """Create the temporary folder of `out`, and missing parents; returns its path and the descriptor of its lock.
+    Leftovers are recovered and `check` is called first. Raises InputError and OSError."""
     out.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with locked_folder(out.parent):
         recover(out.parent)
@@ -77,7 +85,7 @@ def _begun(out: Path, check: Callable[[], None]) -> tuple[Path, int]:
 
 
 def _is_filled(path: Path) -> bool:
-    """Whether a process fills this folder now, or has just put it in its place."""
+    """Whether a process holds the lock of this temporary folder, or has just renamed it."""
     try:
         file = held(path / LOCK)
     except FileNotFoundError:
@@ -88,17 +96,19 @@ def _is_filled(path: Path) -> bool:
 
 
 def _remove(folder: Path) -> None:
+    """Delete a folder and its content, even while another process deletes it too."""
     while folder.exists():
         with contextlib.suppress(FileNotFoundError):  # whoever filled it is removing it too
             shutil.rmtree(folder)
 
 
 def _beside(out: Path, kind: str) -> Path:
+    """Hidden path next to `out` with a random part: `.NAME-….kind`. Nothing is created."""
     return out.with_name(f".{out.name}-{secrets.token_hex(4)}.{kind}")
 
 
 def _seal(folder: Path) -> None:
-    """Make all in a folder its owner's alone, and force it to the disk."""
+    """Restrict all folders (0700) and files (0600) of a folder to their owner, and sync them to disk."""
     for place, _, names in os.walk(folder):
         os.chmod(place, 0o700)
         for path in (Path(place, name) for name in names):
@@ -109,6 +119,11 @@ def _seal(folder: Path) -> None:
 
 
 def _publish(made: Path, out: Path, check: Callable[[], None]) -> None:
+    """Rename `made` to `out`; an existing `out` is moved aside first and deleted afterwards.
+
+    If `check` raises InputError, `made` gets the next free name `OUT-2`, `OUT-3`, …, and InputError with that name is
+    raised.
+    """
     try:
         check()
     except InputError as error:

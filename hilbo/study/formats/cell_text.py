@@ -1,11 +1,10 @@
-"""The rule for participants' ids, and the one for text in the cells of a table.
+"""Rules for participants' ids, and for text in the cells of a table (protection against CSV injection).
 
 Loads no JAX, no pandas.
 
 A spreadsheet runs a text cell that begins with =, @, + or - (OWASP, "CSV injection"). Where a cell ends depends on the
-country that it is set to: the text `a;=1+1` is two cells in half of Europe. hilbo refuses such text where it comes in,
-and writes every text as it is: a mark put before it would be another text. Plain numbers and lone dashes are no such
-text.
+locale: the text `a;=1+1` is two cells in half of Europe. hilbo rejects such text on input and writes every text
+unchanged: an escape character would make it another text. Plain numbers and lone dashes are allowed.
 """
 
 import re
@@ -47,13 +46,14 @@ def is_id(participant: str) -> bool:
 
 
 def check_id(participant: str, place: str) -> None:
-    """Refuse what is no pseudonymous id; `place` says where it stands."""
+    """Raise InputError unless this is a valid id; `place`: file and line for the message."""
     if not is_id(participant):
         raise InputError(f'{place}: participant is "{participant}"; {ID_WORDS}.')
 
 
 def but_for_case(names: Iterable[str]) -> str:
-    """The first two different names that are the same but for capitals, in words; empty where there are none."""
+    """The first pair of different ids that are equal apart from capitals, as 'participants "a" and "A"'; "" if there is
+    none."""
     first: dict[str, str] = {}
     for name in names:
         other = first.setdefault(name.casefold(), name)
@@ -63,37 +63,41 @@ def but_for_case(names: Iterable[str]) -> str:
 
 
 def runs_in_a_spreadsheet(text: str) -> bool:
-    """Whether a spreadsheet may take this cell, or what follows a separator in it, for a formula."""
+    """Whether a spreadsheet could take this cell, or a part of it after a comma, semicolon, tab or line break, for a
+    formula."""
     return _begins_a_formula(text.lstrip(" ")) or any(
         _begins_a_formula(part.lstrip('"')) for part in _ENDS.split(text)[1:]
     )
 
 
 def _begins_a_formula(text: str) -> bool:
+    """Whether a text begins with a formula character, and is neither a number nor only dashes, plus signs and
+    blanks."""
     return text.startswith(_BEGINS) and text.strip(_DASHES) != "" and _NUMERAL.fullmatch(text.strip()) is None
 
 
 def formulas(cells: Iterable[str]) -> set[str]:
-    """Those of many cells that a spreadsheet would run."""
+    """The set of those cells that a spreadsheet could run as a formula."""
     return {cell for cell in set(cells) if runs_in_a_spreadsheet(cell)}
 
 
 def no_ids(cells: Iterable[str]) -> set[str]:
-    """Those of many cells that are no participant's id."""
+    """The set of those cells that are not valid participants' ids."""
     return {cell for cell in set(cells) if not is_id(cell)}
 
 
 def check_text(text: str, name: str, place: str = "") -> None:
-    """Refuse text that a spreadsheet would run; `name` says what it is, `place` where it stands."""
+    """Raise InputError if a spreadsheet could run this text as a formula; `name`: what the text is, `place`: its
+    location or "", for the message."""
     if runs_in_a_spreadsheet(text):
         raise InputError(f'{place + ": " if place else ""}{name} is "{text}", {FORMULA_WORDS}.')
 
 
 def is_decimal(cell: str, mark: str) -> bool:
-    """Whether a cell is a number with this decimal mark."""
+    """Whether a cell is a number written with this decimal mark ("," or "."); False for a number without the mark."""
     return mark in cell and _NUMERAL.fullmatch(cell.strip()) is not None
 
 
 def without_decimal_comma(cell: str) -> str:
-    """A number as it is written with a decimal point; anything else as it was, to be refused."""
+    """A number with its decimal comma replaced by a point; any other text unchanged."""
     return cell.replace(",", ".") if is_decimal(cell, ",") else cell

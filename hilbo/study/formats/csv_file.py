@@ -1,7 +1,7 @@
-"""Cells of a table, CSV or Parquet, as text; and columns of them as numbers.
+"""Cells of a CSV or Parquet table as text, and conversion of columns to numbers.
 
-A number means what its decimals say (correctly rounded). Where a CSV table has semicolons or tabs between its cells, a
-comma in a number is the decimal point, and a warning says so. A table is read piece by piece. Whatever is wrong is one
+Numbers are correctly rounded from their decimals. If a CSV table is separated by semicolons or tabs, a comma in a
+number is the decimal point, and a warning says so. A table is read in pieces of 50,000 rows. Every mistake is one
 sentence with the file and the line (Parquet: row).
 """
 
@@ -33,15 +33,15 @@ __all__ = [
 ]
 
 FRAME = "DataFrame"
-"""What a table that is in memory is called in sentences."""
+"""Name in messages of a table that is in memory."""
 
 _PIECE = 50_000  # rows
 
 
 def read_cells(path: str | os.PathLike, needs: str = "a trial table needs a header and an answer") -> pd.DataFrame:
-    """Every cell as text, so that nothing is guessed; the index is the line (CSV) or the row (Parquet).
+    """Read a whole table with every cell as text; the index is the line (CSV) or the row (Parquet), from 1.
 
-    Raises `InputError` for what is no table; `needs` is said of an empty file.
+    Raises `InputError` for a file that is not a table; `needs` ends the message for an empty file.
     """
     return pd.concat(cell_pieces(path, needs))
 
@@ -49,14 +49,16 @@ def read_cells(path: str | os.PathLike, needs: str = "a trial table needs a head
 def cell_pieces(
     path: str | os.PathLike, needs: str = "a trial table needs a header and an answer"
 ) -> Iterator[pd.DataFrame]:
-    """The cells of a table as text, some rows at a time; at least one piece, which may have none."""
+    """Read a table piece by piece, every cell as text, indexed as in `read_cells`. Yields at least one DataFrame, which
+    may have no rows. Raises `InputError` while it is iterated; `needs` ends the message for an empty file."""
     path = Path(path)
     with read_errors(path):
         yield from _parquet_pieces(path) if path.suffix == ".parquet" else _csv_pieces(path, needs)
 
 
 def cells_of(frame: pd.DataFrame) -> pd.DataFrame:
-    """The cells of a table in memory as text, its rows counted from 1. Raises `InputError` for what is none."""
+    """The cells of a DataFrame as text, "" for missing values, with its rows numbered from 1. Raises `InputError` for
+    another type, and for repeated or too many columns."""
     if not isinstance(frame, pd.DataFrame):
         raise InputError(f"{FRAME}: this is a {type(frame).__name__}; give a pandas DataFrame.")
     check_header(list(frame.columns), FRAME)
@@ -64,7 +66,8 @@ def cells_of(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _parquet_pieces(path: Path) -> Iterator[pd.DataFrame]:
-    """The first piece is empty: a table without rows has columns too."""
+    """Read a Parquet file as pieces of text cells. The first piece has no rows, so that a table without rows still has
+    its columns. Raises `InputError` for its column names."""
     from pyarrow.parquet import ParquetFile
 
     with ParquetFile(path) as file:
@@ -77,19 +80,22 @@ def _parquet_pieces(path: Path) -> Iterator[pd.DataFrame]:
 
 
 def _as_text(frame: pd.DataFrame, first_row: int) -> pd.DataFrame:
+    """All cells as text, indexed from `first_row`."""
     index = np.arange(first_row, first_row + len(frame))
     return pd.DataFrame({name: _column_as_text(frame[name]) for name in frame}, index=index, dtype=object)
 
 
 def _column_as_text(column: pd.Series) -> list[str]:
-    """Each cell, empty where it is missing, with the fewest digits that are this number in the column's own precision:
-    0.99 of a float32 column is 0.99, and no number above it."""
+    """Each cell as text, "" where it is missing. Floats have the fewest digits that identify the number in the column's
+    own precision: 0.99 of a float32 column is "0.99"."""
     narrow = column.dtype.kind == "f" and getattr(column.dtype, "itemsize", 8) < 8  # a sparse dtype has no size
     values = column.to_numpy() if narrow else column.tolist()
     return ["" if missing else str(v) for v, missing in zip(values, column.isna().tolist(), strict=True)]
 
 
 def _csv_pieces(path: Path, needs: str) -> Iterator[pd.DataFrame]:
+    """Read a CSV file as pieces of text cells, indexed by line; the attribute "decimal comma" says whether a comma may
+    be the decimal point. Warns if the separator is not a comma. Raises `InputError`."""
     with open_csv(path, needs) as table:
         say_delimiter(table.delimiter, str(path))
         pieces = iter(lambda: [*itertools.islice(table.rows, _PIECE)], [])
@@ -101,15 +107,21 @@ def _csv_pieces(path: Path, needs: str) -> Iterator[pd.DataFrame]:
 
 
 def place(source: str, row: object = None) -> str:
-    """Where in a table: the line of a CSV file, the row of a Parquet file or of one in memory, or the heads of its
-    columns."""
+    """Prefix of an error message, "FILE:LINE: ", or "FILE: row N: " for Parquet and DataFrames; `row` None is the
+    header."""
     if str(source).endswith(".parquet") or source == FRAME:
         return f"{source}: " if row is None else f"{source}: row {row}: "
     return f"{source}:{1 if row is None else row}: "
 
 
-def numbers(text: pd.DataFrame, column: str, source: str, words: str, valid) -> pd.Series:
-    """A column as float64, each cell correctly rounded; `valid` says which values may be, `words` which those are."""
+def numbers(
+    text: pd.DataFrame, column: str, source: str, words: str, valid: Callable[[pd.Series], pd.Series]
+) -> pd.Series:
+    """A column of text cells as float64, each correctly rounded.
+
+    `valid`: function of the float Series that returns a Boolean Series of the allowed values; `words` describes them in
+    the message. Raises `InputError` for the first cell that is no finite, allowed number, and for mixed decimal marks.
+    """
     cells = _with_points(text, column, source)
     comma = text.attrs.get("decimal comma", False)
     try:
@@ -129,11 +141,12 @@ def numbers(text: pd.DataFrame, column: str, source: str, words: str, valid) -> 
 
 
 def answer_forms(responses: Sequence[str]) -> tuple[dict[str, int], str]:
-    """How an answer may be written -> its category from 0, and the words for what else than a label may be written.
+    """Accepted texts of a response -> category from 0, and the description of what is accepted besides labels ("" for
+    only labels).
 
-    Labels are compared as text. Ranks from 1 are understood only if no label reads as a number: of a scale with the
-    labels "1.0", "1.5", "2.0" a rank would be another answer. Of one with whole numbers "6.0" is 6: so pandas writes a
-    column in which an answer is missing.
+    If all labels are whole numbers, "6.0" and "6,0" also mean the label "6", since pandas writes a column with missing
+    cells so. If some label reads as a number otherwise, only labels are accepted. If no label does, ranks from 1 are
+    accepted too.
     """
     forms = {label: i for i, label in enumerate(responses)}
     if all(re.fullmatch("0|-?[1-9][0-9]*", label) for label in responses):
@@ -145,9 +158,9 @@ def answer_forms(responses: Sequence[str]) -> tuple[dict[str, int], str]:
 
 
 def parameter_values(text: pd.DataFrame, parameter: Parameter, source: str) -> pd.Series:
-    """A parameter's column in physical numbers, of levels, which stand there by their names, the places in the list.
+    """A parameter's column of text cells as float64 in physical units; names of levels become their index from 0.
 
-    Raises `InputError` for what is no number of the range, or none of the levels.
+    Raises `InputError` for a cell that is no number in the range (whole, for an integer parameter), or no level.
     """
     if parameter.levels:
         cells = text[parameter.name].str.strip()
@@ -166,7 +179,8 @@ def parameter_values(text: pd.DataFrame, parameter: Parameter, source: str) -> p
 
 
 def _with_points(text: pd.DataFrame, column: str, source: str) -> list[str]:
-    """The cells of a column, its numbers with a decimal point. Raises `InputError` for commas and points in one."""
+    """Cells of a column, with decimal commas replaced by points if the file is one whose numbers may have them. Raises
+    `InputError` for commas and points in one column."""
     cells = text[column].tolist()
     if not text.attrs.get("decimal comma", False):
         return cells
@@ -181,6 +195,7 @@ def _with_points(text: pd.DataFrame, column: str, source: str) -> list[str]:
 
 
 def _number(cell: str) -> float:
+    """A cell as a float; NaN if it is none. Underscores are not accepted."""
     try:
         return np.nan if "_" in cell else float(cell)  # Python reads 1_5 as 15
     except ValueError:
@@ -188,7 +203,8 @@ def _number(cell: str) -> float:
 
 
 def refuse(wrong: pd.Series, source: str, sentence: Callable[[object], str]) -> None:
-    """Raise `InputError` with `sentence(row)` for the first row that is wrong."""
+    """Raise `InputError` with `sentence(row)` for the first True of `wrong` (Boolean, indexed by row); do nothing if
+    there is none. `source`: the file, for the message."""
     if wrong.any():
         row = wrong.idxmax()
         raise InputError(f"{place(source, row)}{sentence(row)}")

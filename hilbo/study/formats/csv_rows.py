@@ -1,4 +1,4 @@
-"""CSV files as rows of text: the one place that reads and writes them.
+"""Reading and writing CSV files as rows of text; all CSV files pass through here.
 
 A file is UTF-8, with or without a byte order mark. Its cells are separated by commas, or, as spreadsheets of many
 countries write it, by semicolons or tabs; blanks before a cell are not part of it. Loads no JAX, no pandas.
@@ -27,7 +27,7 @@ Rows = Iterator[tuple[int, list[str]]]
 
 
 class CsvTable(NamedTuple):
-    """A CSV file with a header that is being read."""
+    """An open CSV file whose header was read; its rows are read as they are iterated."""
 
     header: list[str]
     """Names of the columns, without blanks around them."""
@@ -38,10 +38,11 @@ class CsvTable(NamedTuple):
 
 @contextlib.contextmanager
 def open_csv(path: str | os.PathLike, needs: str, *, fill: bool = False) -> Iterator[CsvTable]:
-    """A table with a header. `needs` is said of an empty file; `fill`: the last cells of a row may be missing.
+    """Context manager that opens a CSV file and reads its header. `needs`: end of the message for an empty file;
+    `fill`: pad short rows with empty cells.
 
-    Raises `InputError` for a file that cannot be read, a column that stands there twice, and, while the rows are read,
-    for one that is longer or shorter than the header.
+    Raises `InputError` for a file that cannot be read, a repeated column, and, while the rows are iterated, for a row
+    that is longer than the header, or shorter without `fill`.
     """
     with csv_rows(path) as (every, delimiter):
         rows = ((line, cells) for line, cells in every if any(cells))  # no empty line, no spreadsheet's row of commas
@@ -54,8 +55,8 @@ def open_csv(path: str | os.PathLike, needs: str, *, fill: bool = False) -> Iter
 
 @contextlib.contextmanager
 def csv_rows(path: str | os.PathLike) -> Iterator[tuple[Rows, str]]:
-    """All rows of a file, whatever their lengths, and the delimiter: of comma, semicolon and tab what its first line
-    with text has most of. Raises `InputError`, also while the rows are read."""
+    """Context manager that gives an iterator of all rows, of any lengths, and the delimiter: the most frequent of
+    comma, semicolon and tab in the first line with text. Raises `InputError`, also while the rows are iterated."""
     with read_errors(path), Path(path).open(newline="", encoding="utf-8-sig") as file:
         first = next((line for line in file if line.strip()), "")
         if first.lower().startswith("sep="):
@@ -66,15 +67,15 @@ def csv_rows(path: str | os.PathLike) -> Iterator[tuple[Rows, str]]:
 
 
 def csv_text(rows: Iterable[Sequence[str]], delimiter: str = ",") -> str:
-    """Rows as the text of a CSV file."""
+    r"""Rows as the text of a CSV file, with quotes where needed and "\n" after each row."""
     text = io.StringIO()
     csv.writer(text, delimiter=delimiter, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
 def check_header(names: Sequence[str], place: str) -> None:
-    """Refuse a column that stands there twice, and more columns than a spreadsheet has; `place`: file and line, for the
-    sentence."""
+    """Raise `InputError` for a repeated column name, and for more than 16,384 columns; `place`: file and line, for the
+    message."""
     if len(names) > _MOST_COLUMNS:
         raise InputError(
             f"{place}: has {len(names)} columns; a table has {_MOST_COLUMNS} at most, leave out what is not needed."
@@ -86,14 +87,15 @@ def check_header(names: Sequence[str], place: str) -> None:
 
 
 def say_delimiter(delimiter: str, source: str) -> None:
-    """Warn where it is no comma: a comma in a number is then the decimal point."""
+    """Warn if the delimiter is not a comma, because a comma in a number is then the decimal point."""
     if delimiter != ",":
         warn_caller(f"{source}: is read with {_DELIMITERS[delimiter]} between its cells; 1,5 is one and a half.")
 
 
 @contextlib.contextmanager
 def read_errors(path: str | os.PathLike) -> Iterator[None]:
-    """Whatever goes wrong while a table is read, CSV or Parquet, as an `InputError` with the file."""
+    """Context manager that converts errors while a table is read (OSError, ValueError, csv.Error) to `InputError` with
+    the file and the remedy. Raises it at once for a spreadsheet's file name."""
     try:
         if Path(path).suffix.lower() in _SPREADSHEETS and Path(path).is_file():
             raise InputError(f"{path}: {_SPREADSHEET}.")
@@ -108,7 +110,7 @@ def read_errors(path: str | os.PathLike) -> Iterator[None]:
 
 
 def _unreadable(path: Path, error: Exception) -> str:
-    """Why a file is no table, and what to do."""
+    """Text of the message about a file that is not a table: reason and remedy, from its first bytes and the error."""
     with path.open("rb") as file:
         begin = file.read(4)
     if begin == b"PK\x03\x04":
@@ -123,7 +125,7 @@ def _unreadable(path: Path, error: Exception) -> str:
 
 
 def _numbered(reader) -> Rows:
-    """Python's csv module knows the line on which a row ends, and so that on which the next begins."""
+    """Rows of a csv.reader, each with the number of the line on which it begins."""
     line = 1
     for cells in reader:
         yield line, cells
@@ -131,6 +133,8 @@ def _numbered(reader) -> Rows:
 
 
 def _as_long(rows: Rows, length: int, source: str, fill: bool) -> Rows:
+    """Rows whose cells are as many as the header's (`length`). Short ones are padded with `fill`; otherwise
+    `InputError` is raised."""
     for line, cells in rows:
         missing = length - len(cells)
         if missing < 0 or (missing and not fill):

@@ -1,7 +1,7 @@
-"""Reading what hilbo itself has written: typed JSON, and the digest by which an accidental change is seen.
+"""Reading of files that hilbo itself has written: typed JSON, and a digest that shows accidental changes.
 
-A digest is the SHA-256 of what stands before it. It shows damage, and an edit by somebody who did not know of it; it
-has no secret, so that it proves nothing against somebody who means to forge.
+A digest is the SHA-256 of the text before it. It detects damage and careless edits; it has no secret, so that it is no
+protection against forgery.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ _SLACK = 1e-9  # of a parameter's range: what rounding may do
 
 
 def read_bytes(path: str | os.PathLike) -> bytes:
-    """The content of a file. Raises InputError."""
+    """The content of a file. Raises InputError if it cannot be read."""
     try:
         return Path(path).read_bytes()
     except OSError as error:
@@ -36,10 +36,8 @@ def read_bytes(path: str | os.PathLike) -> bytes:
 
 
 def decoded(content: bytes, kind: Any, source: str, what: str) -> Any:
-    """JSON as a record of this type. `what`: what the file should be and where it comes from, ends the sentence.
-
-    Raises InputError.
-    """
+    """Parse JSON as an object of the type `kind`. `what`: middle of the message, what the file is not and where to get
+    one. Raises InputError."""
     try:
         return msgspec.json.decode(content, type=kind)
     except UNREADABLE as error:
@@ -47,7 +45,7 @@ def decoded(content: bytes, kind: Any, source: str, what: str) -> Any:
 
 
 def converted(raw: Any, kind: Any, source: str, what: str) -> Any:
-    """As `decoded`, from plain Python data."""
+    """As `decoded`, from parsed Python data. Raises InputError."""
     try:
         return msgspec.convert(raw, kind)
     except UNREADABLE as error:
@@ -60,7 +58,8 @@ def digest_of(content: bytes) -> str:
 
 
 def sealed(pieces: Iterable[str]) -> Iterator[str]:
-    """The text of a JSON object in pieces, the last of which closes it, with the digest of the text as its last key."""
+    """Yield the text of a JSON object, given in pieces, with one more key at its end: "digest", the digest of the text
+    before it. The last piece must end with a line break, "}" and a line break."""
     hashed, held = hashlib.sha256(), ""
     for piece in pieces:
         hashed.update(held.encode())
@@ -72,7 +71,8 @@ def sealed(pieces: Iterable[str]) -> Iterator[str]:
 
 
 def unsealed(content: bytes, digest: str | None, source: str) -> None:
-    """Refuse a file whose `digest` is not that of its text. Files without one are as they are."""
+    """Raise InputError if `digest`, as read from the content, is not the digest of the text before it. None (a file
+    without a digest) passes. Returns nothing."""
     if digest is None:
         return
     match = _SEAL.search(content)
@@ -86,8 +86,12 @@ def unsealed(content: bytes, digest: str | None, source: str) -> None:
 def check_values(
     values: Mapping[str, float | str | None], parameters: Iterable[Parameter], source: str, what: str
 ) -> dict[str, float]:
-    """A rendering's parameters in physical units, each a finite number in the study's range, or a level by its name or
-    its place in the list, which is what becomes of it. Raises InputError."""
+    """Check a point's parameters, in physical units or as names of levels; returns parameter -> number, levels by their
+    index.
+
+    `what`: name of the point in messages. A value may exceed the range by 1e-9 of it (rounding) and is not clipped.
+    Further keys are dropped. Raises InputError for a missing, non-finite or out-of-range value, or an unknown level.
+    """
     checked = {}
     for parameter in parameters:
         value = values.get(parameter.name)

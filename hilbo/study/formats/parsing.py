@@ -1,7 +1,7 @@
-"""Parsers of text from outside: whatever they raise becomes one sentence, and what they read can be worked with.
+"""Parsers of text from users: every exception becomes one sentence, and the size of what is read is limited.
 
-A parser meets more than mistakes of syntax: an integer with thousands of digits is a plain `ValueError`, and lists
-within lists end in a `RecursionError`, in the parser or in whatever walks through its result.
+A parser meets more than syntax errors: an integer with thousands of digits is a plain `ValueError`, and deeply nested
+lists end in a `RecursionError`, in the parser or in code that walks its result.
 """
 
 import re
@@ -21,7 +21,8 @@ _BITS = 64  # of an integer, by the TOML specification
 
 
 def toml(text: str, source: str) -> dict[str, object]:
-    """The tables of a TOML file. Raises `InputError` with the line of the mistake, where it is known."""
+    """Parse TOML text. `source`: the file, for the message. Raises `InputError` with the line of the mistake where it
+    is known."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -36,10 +37,8 @@ def toml(text: str, source: str) -> dict[str, object]:
 
 
 def check_parsed(raw: object) -> None:
-    """Refuse parsed tables with more than 20 levels, and integers of more than 64 bits.
-
-    Raises `InputError` that begins with the key's path.
-    """
+    """Raise `InputError`, which begins with the key's path, for tables nested more than 20 deep and integers of 64 bits
+    or more."""
     pending: list[tuple[str, object, int]] = [("", raw, 0)]
     while pending:
         path, value, depth = pending.pop()
