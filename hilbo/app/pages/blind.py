@@ -1,8 +1,8 @@
-"""What an experimenter is told who is not to know the parameters: how far the session is, the answers, and labels.
+"""The view of an experimenter who must not know the parameters: progress, answers, and labels of renderings.
 
-Made of what is known to hold no parameter, never by leaving something out: names of sets, choices, predictions, what
-was confirmed and reasons that state values are not in it. A label (`set_codes.label_of`) stands for each rendering, the
-same that the preparer sees.
+Only what can hold no parameter is copied from the full view: names of sets, choices, predictions, confirmed values and
+reasons that state values are left out. Each rendering has a label (`set_codes.label_of`), the same that the preparer
+sees.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,8 @@ _BANNER = "Blind: this page shows no parameter; labels stand for what is present
 
 
 def experimenter(hub: HubInterface, seen: Mapping[str, Any]) -> View:
-    """The view, of what the experimenter would see who knows all."""
+    """The blind experimenter's view, as a dict for JSON. `seen`: the full view of `views.experimenter`, which is not
+    changed."""
     state, trial = hub.state, hub.state.pending
     blocks = seen["trial"][: len(state.header.blocks)]
     labels = [[f"Rendering {side.upper()}", label] for side, label in _labels(hub, trial).items()]
@@ -47,12 +48,13 @@ def experimenter(hub: HubInterface, seen: Mapping[str, Any]) -> View:
 
 
 def _labels(hub: HubInterface, trial: Trial | None) -> dict[str, str]:
-    """Side -> label."""
+    """Side ("a", "b") -> label of its rendering in a trial; empty without a trial."""
     return {} if trial is None else {side: label_of(values, hub.tag) for side, values in trial.renderings.items()}
 
 
 def _table(hub: HubInterface, rows: list[View]) -> View:
-    """The trials, the newest first, with labels in the place of values and of names of sets."""
+    """The table of trials, newest first, with a label for each rendering in the column after the remark. `rows`: those
+    of the full view, in the same order."""
     labelled = []
     for trial, row in zip(reversed(hub.state.trials), rows, strict=True):
         place, answer, remark = row["cells"][:3]
@@ -62,7 +64,7 @@ def _table(hub: HubInterface, rows: list[View]) -> View:
 
 
 def _unvalued(event: Event) -> Event:
-    """The event without what may state a value, or a set's name."""
+    """A copy of an event without what may state a value or the name of a set."""
     data = {key: value for key, value in event.data.items() if key not in ("sets", "choice")}
     if event.kind == "missed":
         data["reason"] = str(data["reason"]).partition(":")[0]
@@ -70,5 +72,6 @@ def _unvalued(event: Event) -> Event:
 
 
 def _first_words(remark: str) -> str:
-    """`void: stimulus: off`, of a longer reason."""
+    """The first three parts of a remark, which colons separate, such as `void: stimulus: off`; the later ones may state
+    values."""
     return ":".join(remark.split(":")[:3])

@@ -1,4 +1,4 @@
-"""The log's events as sentences, and the trials as rows, for the experimenter's page."""
+"""The log's events as sentences, and the trials as rows of a table, for the experimenter's page."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -20,23 +20,24 @@ _DEVICE = {"ready": "is ready", "running": "renders", "stopped": "is at rest", "
 
 
 def place_of(trial: Trial) -> str:
-    """What a trial is called on the experimenter's page: the letter of its phase and its number."""
+    """The name of a trial on the experimenter's page: the first letter of its phase and its number in it, such as
+    "O12"."""
     return trial.data["phase"][0].upper() + str(trial.number)
 
 
 def meant(trial: Trial | None) -> dict[str, Any] | None:
-    """A trial as a command names it."""
+    """The id and the name of a trial, {"trial": 14, "name": "O12"}, for the page's commands; None without a trial."""
     return None if trial is None else {"trial": trial.id, "name": place_of(trial)}
 
 
 def line(state: LiveSession, event: Event) -> list[str]:
-    """An event's number, time of day, and sentence."""
+    """An event's sequence number, local time of day, and sentence, as three texts."""
     at = datetime.fromtimestamp(event.time).strftime("%H:%M:%S")
     return [str(event.seq), at, sentence(state, event)]
 
 
 def sentence(state: LiveSession, event: Event) -> str:
-    """What happened; `state` is one after the event."""
+    """What an event did, as a sentence. `state`: any state of the session after the event."""
     data = event.data
     trial = data.get("id", data.get("trial") if event.kind == "device" else None)
     name = "" if trial is None else place_of(state.trial(trial))
@@ -47,7 +48,7 @@ def sentence(state: LiveSession, event: Event) -> str:
 
 
 def _because(data: Mapping[str, Any]) -> str:
-    """A reason after a colon, and the end of the sentence."""
+    """The end of a sentence: ": reason." where the data have a reason, else "."."""
     reason = str(data.get("reason", "")).strip().rstrip(".")
     return f": {reason}." if reason else "."
 
@@ -63,6 +64,7 @@ def _proposed(_state, name, data):
 
 
 def _presented(_state, name, data):
+    """Which step of a trial (`name`) begins or ends."""
     shown = _SHOWN[data["show"]]
     if data["show"] == "neutral":
         return f"{name}: a neutral interval {'begins' if data['on'] else 'ends'}."
@@ -70,6 +72,8 @@ def _presented(_state, name, data):
 
 
 def _answered(_state, name, data):
+    """The answer to a trial (`name`) and its response time; a remark on one that was given too quickly, and the flags
+    of the device's samples."""
     values, took = data["values"], data["browser"].get("response_s")
     classes = {side: values[f"class_{side}"] for side in "ab" if f"class_{side}" in values}
     words = list(classes.values()) if len(values) == 1 else [f"{s.upper()} {c}" for s, c in classes.items()]
@@ -82,13 +86,15 @@ def _answered(_state, name, data):
 
 
 def _quick(browser: Mapping[str, float]) -> str:
-    """That one of several questions was answered sooner than it can be read, as a doubled key does; else empty."""
+    """A remark, without a full stop, if one of several questions was answered in less than `_QUICK` s, faster than it
+    can be read; else empty."""
     shortest = browser.get("shortest_s", math.inf)
     return f"one question answered after only {shortest:.2f} s" if shortest < _QUICK else ""
 
 
 def _flags(telemetry: Mapping[str, int] | None) -> str:
-    """How many samples of a trial the device flagged, as a sentence after another; empty where it flagged none."""
+    """How many samples of a trial have each of the device's flags, as a sentence after a space; empty without telemetry
+    or flags."""
     if telemetry is None or set(telemetry) == {SAMPLES}:
         return ""
     words = ", ".join(f"{name.replace('_', ' ')} {telemetry[name]}" for name in FLAGS if name in telemetry)
@@ -96,11 +102,14 @@ def _flags(telemetry: Mapping[str, int] | None) -> str:
 
 
 def _repeated(trial, name, seq):
+    """Whether a trial will be repeated later (if it was answered before event number `seq`) or begins again now."""
     answered = trial.answered is not None and trial.answered["seq"] < seq
     return f"{name} will be asked once more, later." if answered else f"{name} begins again from its first step."
 
 
 def _device(state, name, data):
+    """The new condition of the device, program or preparer, with its reason, and whether it made the trial (`name`)
+    void."""
     stimulus = state.study.stimulus
     who = "The device" if stimulus is None else _WHO[stimulus.role]
     condition = data["condition"]
@@ -134,8 +143,8 @@ _SENTENCES: dict[str, Callable[[LiveSession, str, Mapping[str, Any]], str]] = {
 
 
 def table(state: LiveSession) -> dict[str, Any]:
-    """The trials, the newest first: the answer, what is to be known of it, and what was presented: the sets' names
-    where all were planned, the parameters where some were chosen."""
+    """Head and rows of the table of trials, newest first: name, answer, remark, and what was presented: the names of
+    the sets if all trials were planned, else the value of each parameter."""
     parameters = state.study.space.parameters
     chosen = any(not trial.sets for trial in state.trials)
     heads = [f"{p.name} ({p.unit})" if p.unit else p.name for p in parameters] if chosen else ["sets"]
@@ -146,7 +155,9 @@ def table(state: LiveSession) -> dict[str, Any]:
 
 
 def _row(state: LiveSession, trial: Trial, chosen: bool) -> dict[str, Any]:
-    """`kind` is now, voided, repeated or ""; `restore` names a voided answer that may be restored."""
+    """A row of the table: its cells; `kind`, "now", "voided" (answer or trial does not count), "repeated" (it has a
+    remark) or ""; and for a voided answer that can be restored its trial. `chosen`: the table has parameters, not
+    sets."""
     shown = _values(state, trial) if chosen else [" / ".join(trial.sets.values())]
     answer, remark = " ".join((trial.values or {}).values()), _remark(state, trial)
     discarded = trial.status not in ("pending", "answered")
@@ -160,7 +171,7 @@ def _row(state: LiveSession, trial: Trial, chosen: bool) -> dict[str, Any]:
 
 
 def _values(state: LiveSession, trial: Trial) -> list[Any]:
-    """What was presented, a value for each parameter; of two renderings both in one text."""
+    """The values that were presented, one for each parameter; those of a pair are both in one text."""
     parameters, both = state.study.space.parameters, list(trial.presented.values())
     if len(both) > 1:
         return [" / ".join(p.words(values[p.name]) for values in both) for p in parameters]
@@ -168,7 +179,8 @@ def _values(state: LiveSession, trial: Trial) -> list[Any]:
 
 
 def _remark(state: LiveSession, trial: Trial) -> str:
-    """Whether it does not count, and why; and how often it was presented."""
+    """Why a trial does not count, which trial it repeats, how often it was presented, whether it will be repeated;
+    parts are separated by semicolons, and empty if none applies."""
     reason = str((trial.voided or {}).get("reason", ""))
     status = {
         "void": "void",

@@ -9,7 +9,8 @@ __all__ = ["duration", "minutes_left"]
 
 
 def duration(seconds: float) -> str:
-    """A duration of `seconds` in words, in its two largest units: "2 d 3 h", "1 h 5 min", "7 min"; below 1 min in s."""
+    """A duration of `seconds` in words, in its two largest units without zeros: "2 d 3 h", "1 h 5 min", "7 min"; below
+    1 min in s."""
     if seconds < 60.0:
         return f"{seconds:.0f} s"
     minutes = int(seconds / 60.0)
@@ -19,8 +20,8 @@ def duration(seconds: float) -> str:
 
 
 def minutes_left(state: LiveSession) -> float:
-    """Minutes to the end, rests included: the trials left at this participant's median pace, or, before the third
-    answer, at the protocol's seconds and half as many for the answer."""
+    """Estimated minutes to the end of the session: the trials left times the median time between this participant's
+    answers or, before the third answer, times 1.5 times the duration of the protocol's steps; plus the rests ahead."""
     times = sorted(t.answered["time"] for t in state.trials if t.answered is not None)
     gaps = np.diff(times)
     total = 0.0

@@ -20,10 +20,10 @@ View = dict[str, Any]
 
 
 def participant_view(state: LiveSession) -> View:
-    """The data of the participant's page; nothing else of a session may reach their browser.
+    """What the participant's page is made from; nothing else of a session may reach their browser.
 
     `screen` and its `message`; `trial` (id, presentation, steps with their texts and seconds, the running `step`,
-    `felt`, `asks`) or None; `progress` (done, of, text); `may` (which buttons); `texts`.
+    `felt`, `asks`) or None; `progress` (done, of, text); `rest` (s) or None; `may` (which buttons); `texts`.
     """
     session = state.study.session
     trial = state.pending if state.screen in ("trial", "paused") else None
@@ -43,13 +43,15 @@ def participant_view(state: LiveSession) -> View:
 
 
 def _spare(state: LiveSession) -> bool:
-    """Whether the warm-up has another trial to offer."""
+    """Whether the warm-up has another trial to offer. Only for the screen "ready"."""
     before = None if state.block is None else state.warm_up(state.block)
     assert before is not None  # the screen is "ready"
     return state.quota(before) < len(state.header.blocks[before].trials)
 
 
 def _shown_trial(state: LiveSession, trial: Trial) -> View:
+    """A trial for the participant: its steps, the index of the running one, whether all renderings were presented
+    (`felt`), and its questions; no parameters."""
     session = state.study.session
     asks = protocol(session, state.header.blocks[trial.block].phase).asks
     alone = "b" not in trial.renderings
@@ -68,12 +70,15 @@ def _shown_trial(state: LiveSession, trial: Trial) -> View:
 
 
 def _step_text(show: str, alone: bool) -> str:
+    """The key of the participant's text for a step. `alone`: the trial has a single rendering."""
     if show == "neutral":
         return "neutral"
     return "feel_test" if alone and show == "a" else f"feel_{show}"
 
 
 def _ask(state: LiveSession, ask: str, alone: bool) -> View:
+    """A question and its choices. `ask`: "class_a", "class_b" or "preferred"; `alone`: the trial has a single
+    rendering."""
     session = state.study.session
     if ask == "preferred":
         choices = [{"value": side, "label": session.text(side), "definition": ""} for side in ("a", "b")]
@@ -87,8 +92,8 @@ def _ask(state: LiveSession, ask: str, alone: bool) -> View:
 
 
 def _progress(state: LiveSession) -> View:
-    """Answered and planned trials of the current block (at the end: of the last one), and the text with the trial's
-    number, counted from 1."""
+    """Answered and required trials of the block of the pending trial (without one: of the current block, of the warm-up
+    that has just ended, or at the end of the last block), and the text with the number of the trial, from 1."""
     block = len(state.header.blocks) - 1 if state.block is None else state.block
     if state.pending is not None:
         block = state.pending.block
@@ -103,7 +108,7 @@ def _progress(state: LiveSession) -> View:
 
 
 def experimenter_view(state: LiveSession) -> View:
-    """The whole state, for the experimenter's page and for programs."""
+    """The whole state as a dict for JSON, parameters included, for the experimenter's page and for programs."""
     header = state.header
     return {
         "study": {"name": state.study.name, "hash": state.study.hash, "responses": list(state.study.responses)},
@@ -137,11 +142,13 @@ def experimenter_view(state: LiveSession) -> View:
 
 
 def _put_off(state: LiveSession, block: int, k: int) -> View:
-    """A planned trial that was moved to the end, and how often the device stopped it."""
+    """Planned trial number `k` of a block, which was moved to the end, and how often the device stopped in it
+    (`stops`)."""
     return msgspec.to_builtins(state.header.blocks[block].trials[k]) | {"stops": state.stops(block)[k]}
 
 
 def _whole_trial(state: LiveSession, trial: Trial) -> View:
+    """All data of a trial, parameters included."""
     return {
         **trial.data,
         "status": trial.status,

@@ -1,6 +1,6 @@
 """Slices of the posterior mean through its maximum, for the experimenter's page; one compiled function.
 
-There is one for each pair of parameters. Of a single parameter there is one, with the answers up.
+There is a slice for each pair of parameters. A single parameter has one slice, with the answer on the vertical axis.
 """
 
 import itertools
@@ -31,13 +31,13 @@ _Pair = tuple[int, int | None]  # of parameters, across and up
 
 
 class Maps:
-    """Makes the slices of a session's map, material by material, from the posteriors that its chooser keeps."""
+    """Computes the slices of a session's posterior, material by material, from the fits that its chooser caches."""
 
     def __init__(self, chooser: LiveChooser):
         self._chooser = chooser
 
     def warm(self) -> None:
-        """Compile what `slices` and `trust` need, with no answers."""
+        """Compile what `slices` and `trust` need, for each block whose trials are chosen, by a fit without answers."""
         for block in self._chooser.chosen_blocks:
             fitted, study = self._chooser.fitted(Answers(block)), self._chooser.study(block)
             self._sliced(Answers(block), None)
@@ -45,7 +45,9 @@ class Maps:
             progress.trust(self._chooser, block, fitted, fitted.point, following)
 
     def trust(self, state: LiveSession) -> list[list[str]]:
-        """How far the session has come, in words: name and value."""
+        """How far the session has come, as rows of name and value: the best rendering so far, its probability of the
+        highest answer, its expected shift with one more trial, and the agreement of repeated trials. Only rows that are
+        known; of the block that is running, or the last one."""
         rows = []
         chosen = [i for i in self._chooser.chosen_blocks if state.answers(i)]
         block = next((i for i in chosen if not state.full(i)), chosen[-1] if chosen else None)
@@ -64,9 +66,12 @@ class Maps:
         return rows
 
     def slices(self, state: LiveSession) -> dict[str, Any] | None:
-        """For each pair of parameters, or the one: mean on a grid (row by row, None where not feasible), the maximum,
-        and the trials with their distance from the slice; and the parameters' ranges. None where the session chooses
-        nothing, no slices before there is an answer."""
+        """A dict for JSON, None if the session chooses no trials.
+
+        "slices": for each pair of parameters, or the only one, the posterior mean on a grid (rows from low to high;
+        None where not feasible), the maximum, and the trials with their distance from the slice; empty before the first
+        answer. "ranges": each parameter's range and unit.
+        """
         blocks = self._chooser.chosen_blocks
         if not blocks:
             return None
@@ -85,7 +90,8 @@ class Maps:
         return {"slices": slices, "ranges": ranges}
 
     def _sliced(self, answers: Answers, asked: Mapping[str, float] | None) -> list[dict[str, Any]]:
-        """`slices` after some answers; `asked`: the rendering that is being felt."""
+        """The slices after some answers, as dicts for JSON. `asked`: parameters of the rendering that is presented, in
+        physical units, or None."""
         study, fitted = self._chooser.study(answers.block), self._chooser.fitted(answers)
         names = study.space.names
         best = self._chooser.best(answers.block, fitted)
@@ -98,12 +104,13 @@ class Maps:
 
 
 def _pairs(dim: int) -> list[_Pair]:
-    """The parameters across and up of each slice; a single one has nothing up."""
+    """Indices of the parameters on the horizontal and vertical axis of each slice; (0, None) for a single parameter."""
     return [*itertools.combinations(range(dim), 2)] or [(0, None)]
 
 
 class _Slices(NamedTuple):
-    """The best point of the unit cube, and the posterior mean and what is feasible on the grids through it."""
+    """The maximum in the unit cube, and the posterior mean and the feasibility on the grids through it (row: vertical
+    axis)."""
 
     best: Float[Array, " d"]
     mean: Float[Array, "pairs side side"]
@@ -113,7 +120,8 @@ class _Slices(NamedTuple):
 def _slice(study, maps: _Slices, k: int, pair: _Pair, marks, levels, felt) -> dict[str, Any]:
     """Slice `k` of `maps` as JSON for the page: means (None where infeasible), the values of the other parameters, and
     each answer with its distance from the slice. `pair`: indices of the parameters across and up; without an up, an
-    answer's height is its level. `marks` (n, d) and `levels` (n,): the answers; `felt` (d,): the present rendering."""
+    answer's height is its level. `marks` (n, d) and `levels` (n,), on [0, 1]: the answers; `felt` (d,): the present
+    rendering, or None. Points are in the unit cube."""
     best, names = maps.best, study.space.names
     others = [i for i in range(len(names)) if i not in pair]
     held = [_held(study.space.parameters[i], float(best[i])) for i in others]
@@ -141,12 +149,15 @@ def _slice(study, maps: _Slices, k: int, pair: _Pair, marks, levels, felt) -> di
 
 
 def _held(parameter: Parameter, unit: float) -> str:
+    """Name and value, "name = value", of a parameter that is constant in a slice; `unit`: its value in the unit
+    cube."""
     value = float(parameter.to_physical(np.asarray(unit)))
     return f"{parameter.name} = {parameter.words(value) if parameter.levels else f'{value:.3g}'}"
 
 
 def _axis(parameter: Parameter) -> Float[np.ndarray, " side"]:
-    """Where an axis of the grids is, in the unit cube: of levels bands of one width."""
+    """Grid points of a parameter's axis in the unit cube, (side,); each level of a categorical parameter fills a band
+    of equal width."""
     count = len(parameter.levels)
     if not count:
         return np.linspace(0.0, 1.0, _SIDE)
@@ -155,6 +166,7 @@ def _axis(parameter: Parameter) -> Float[np.ndarray, " side"]:
 
 @program
 def _slices(study: Study, posterior: Posterior, physical: Float[Array | np.ndarray, " d"]) -> _Slices:
+    """Posterior mean and feasibility on the grids of all slices through a point (d,) in physical units."""
     best = study.space.to_unit(physical)
     axes = [jnp.asarray(_axis(p), best.dtype) for p in study.space.parameters]
     grids = []

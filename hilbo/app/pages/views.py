@@ -42,13 +42,14 @@ _SCREEN_WORDS = {
 
 
 def trial_name(hub: HubInterface) -> str | None:
-    """The pending trial's name in browsers, which changes whenever the trial is presented again."""
+    """The pending trial's name in browsers, `tag:id.presentation`, new for each presentation; None without a pending
+    trial."""
     trial = hub.state.pending
     return None if trial is None else f"{hub.tag}:{trial.id}.{trial.presentation}"
 
 
 def participant(hub: HubInterface) -> View:
-    """The participant's view; docs/guides/live.md describes it."""
+    """The participant's view, as a dict for JSON; docs/guides/live.md describes it."""
     seen, session, stage = participant_view(hub.state), hub.state.study.session, hub.runner.stage
     trial, screen = seen["trial"], seen["screen"]
     step = _step(hub, trial) if screen == "trial" and stage == "step" else None
@@ -77,9 +78,9 @@ def participant(hub: HubInterface) -> View:
 
 
 def _words(hub: HubInterface, screen: str, stage: str, text: Text) -> tuple[str, str, str]:
-    """Title, message and phase ("hello", "wait" or the name of the screen) of a page while nothing is presented. The
-    text of a screen other than "trial" is split after its first sentence. How to let go of a program's
-    stimulus is in the study's own texts."""
+    """Title, message and phase ("hello", "wait" or the name of the screen) of the participant's page while nothing is
+    presented. The text of a screen other than "trial" is split after its first sentence. A study with a device adds how
+    to release it to the text of the stage "let-go"."""
     if screen == "trial":
         key = {"hello": "title", "between": "sent", "let-go": "let_go", "trouble": "trouble"}.get(stage, "wait")
         more = {"hello": "hello"} | ({"let-go": "lift"} if hub.state.study.stimulus is None else {})
@@ -90,7 +91,8 @@ def _words(hub: HubInterface, screen: str, stage: str, text: Text) -> tuple[str,
 
 
 def _last_of_one(hub: HubInterface, step: View | None) -> bool:
-    """Whether a trial's only rendering is being presented: it may be answered meanwhile, a pair only after both."""
+    """Whether the last step of a trial with a single rendering is presented: it may be answered meanwhile, a pair only
+    after both."""
     pending = hub.state.pending
     return (
         step is not None and step["index"] + 1 == step["count"] and pending is not None and len(pending.renderings) == 1
@@ -98,7 +100,8 @@ def _last_of_one(hub: HubInterface, step: View | None) -> bool:
 
 
 def _step(hub: HubInterface, trial: View) -> View | None:
-    """The step that is being presented; its seconds are those left."""
+    """The step that is presented: its index, texts, duration and the seconds left; None while no step is. `trial`: as
+    in `participant_view`."""
     index, steps = hub.runner.step, trial["steps"]
     if index is None:
         return None
@@ -114,17 +117,20 @@ def _step(hub: HubInterface, trial: View) -> View | None:
 
 
 def _question(ask: View) -> View:
+    """A question of `participant_view`, with the keys that the page uses."""
     options = [{"value": c["value"], "label": c["label"], "text": c["definition"]} for c in ask["choices"]]
     return {"name": ask["name"], "text": ask["question"], "options": options}
 
 
 def _progress(progress: View, text: Text) -> View:
+    """The progress of `participant_view`, with the keys that the page uses; the text names the warm-up."""
     words = f"{text('warm_up')}: {progress['text']}" if progress["warm_up"] else progress["text"]
     return {"done": progress["done"], "of": progress["of"], "text": words}
 
 
 def experimenter(hub: HubInterface) -> View:
-    """The experimenter's view, in the order of the page; `whole` is the complete state, for programs."""
+    """The experimenter's view, as a dict for JSON in the order of the page; `whole` is the complete state, for
+    programs."""
     state, runner = hub.state, hub.runner
     header, trial = state.header, state.pending
     phase = _SCREEN_WORDS.get(state.screen) or _phase_words(hub, trial)
@@ -153,7 +159,7 @@ def experimenter(hub: HubInterface) -> View:
 
 
 def _banners(hub: HubInterface) -> list[str]:
-    """Notices of a session whose data do not count."""
+    """Notices of a session whose data are not ordinary: dry run, simulated device, unblinded."""
     header, banners = hub.state.header, []
     if header.dry_run:
         banners.append("Dry run: nobody takes part, and no table has these answers")
@@ -165,6 +171,7 @@ def _banners(hub: HubInterface) -> list[str]:
 
 
 def _phase_words(hub: HubInterface, trial: Trial | None) -> str:
+    """What the runner does now, in words."""
     runner = hub.runner
     if runner.stage == "step" and trial is not None:
         return participant_view(hub.state)["trial"]["steps"][runner.step]["text"]
@@ -174,6 +181,8 @@ def _phase_words(hub: HubInterface, trial: Trial | None) -> str:
 
 
 def _trial_rows(hub: HubInterface, trial: Trial | None) -> list[list[str]]:
+    """Rows of name and value for the experimenter: progress of each block, time left, pauses, and for a pending trial
+    its renderings, why they were chosen, and the last delay."""
     state = hub.state
     rows = []
     for i, block in enumerate(state.header.blocks):
@@ -195,7 +204,7 @@ def _trial_rows(hub: HubInterface, trial: Trial | None) -> list[list[str]]:
 
 
 def _pause_rows(state: LiveSession) -> list[list[str]]:
-    """The pause that is going on, and those that have been."""
+    """Rows of name and value: the pause that is going on, if it is long enough to count, and the earlier ones."""
     rows, away = [], 0.0 if state.active is None else time.time() - state.active
     if away >= PAUSE and state.screen not in ("done", "ended"):
         at = datetime.fromtimestamp(state.active or 0.0).strftime("%d %b %H:%M")
@@ -208,7 +217,8 @@ def _pause_rows(state: LiveSession) -> list[list[str]]:
 
 
 def choice_rows(choice: View) -> list[list[str]]:
-    """Why a rendering was chosen, as rows of name and value; null stands in logs for numbers that were not finite."""
+    """Why a rendering was chosen, as rows of name and value. `choice`: that of a proposal's data, in which None stands
+    for numbers that were not finite; rows without a number are left out."""
     rows = []
     mean, sd = choice.get("mean"), choice.get("sd")
     if "by" in choice and choice["by"] != "plan":
@@ -230,7 +240,7 @@ def choice_rows(choice: View) -> list[list[str]]:
 
 
 def _how_far(state: LiveSession, block: int) -> str:
-    """Progress of a block: answers, and trials that were skipped or that the device stopped."""
+    """Progress of a block in words: answers, and trials that were skipped or that the device stopped."""
     words = [f"{len(state.counted(block))} of {state.quota(block)}"]
     last, out, excluded = (len(f(block)) for f in (state.put_off, state.skipped, state.excluded))
     words += [f"{last} put off to the end: stopped twice by the device"] if last else []
@@ -240,7 +250,7 @@ def _how_far(state: LiveSession, block: int) -> str:
 
 
 def _set_words(study, values):
-    """A parameter set as text, levels by their names; K0, which is derived, included."""
+    """A parameter set in words; levels by their names, and K0, which is derived, included."""
     parameters = {p.name: p for p in study.space.parameters}
     return ", ".join(
         f"{name} {parameters[name].words(value)} {parameters[name].unit}".strip()
@@ -251,6 +261,8 @@ def _set_words(study, values):
 
 
 def _device(hub: HubInterface) -> View:
+    """State of the rig for the experimenter: title, state, colour (`level`: "bad", "good" or "rest"), words and
+    rows."""
     seen = hub.rig.snapshot
     level = "bad" if seen.lost or seen.state in ("HOLD", "ESTOP") else "good" if seen.state == "RUNNING" else "rest"
     state, rows = "lost" if seen.lost else seen.state.lower(), [list(row) for row in seen.rows]
@@ -260,7 +272,7 @@ def _device(hub: HubInterface) -> View:
 
 
 def _may(hub: HubInterface) -> list[str]:
-    """The commands that are possible now."""
+    """The commands that are possible now, by name."""
     state, seen = hub.state, hub.rig.snapshot
     actions = ["note", "invite"] + ([] if seen.lost else ["estop"])
     if seen.state in ("HOLD", "ESTOP") and not seen.lost:
@@ -283,7 +295,7 @@ def _may(hub: HubInterface) -> list[str]:
 
 
 def map_version(state: LiveSession) -> str:
-    """A version of the map, which changes with the answers and the pending trial."""
+    """A text that changes whenever the map may: with the answers and the pending trial."""
     answered = sum(1 for t in state.trials if t.status == "answered")
     undone = sum(1 for t in state.trials if t.status in ("undone", "void"))
     return f"{answered}.{undone}.{state.pending.id if state.pending else 0}"

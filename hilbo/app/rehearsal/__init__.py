@@ -1,4 +1,4 @@
-"""Sessions without people: a simulated participant, and stand-ins for programs and persons that present.
+"""Sessions without people: a simulated participant, and stand-ins for programs and persons that present renderings.
 
-Real server, real pages, real rig.
+Server, pages and rig are those of a real session.
 """

@@ -1,9 +1,9 @@
-"""A whole session without people: a simulated participant drives real server, real pages and what renders.
+"""A whole session without people: a simulated participant drives real server, real pages and a simulated device.
 
 The server is a process of its own, as `hilbo session` starts it; the device is the firmware's core on a
-pseudo-terminal, whose finger presses while a rendering is shown; in a study without our device a stand-in confirms what
-it is asked for (`stand_in`). The participant's page is in Chromium. The participant is drawn from the study's simulated
-population (`simulation.presets`) and answers from what was really on the device, or was confirmed.
+pseudo-terminal, whose finger presses while a rendering is presented. In a study with [stimulus], a stand-in confirms
+what it is ordered (`stand_in`). The participant's page is in Chromium. The participant is drawn from the study's
+simulated population (`simulation.presets`) and answers from what was really on the device, or was confirmed.
 """
 
 import contextlib
@@ -51,7 +51,8 @@ _HEARD = "(count) => view && view.whole.trials.filter((t) => t.status === 'answe
 
 
 class Decider:
-    """A simulated person's answers about renderings, in the labels of the study."""
+    """A simulated participant, drawn from a population; called with a trial and a question, it gives a label of the
+    study."""
 
     def __init__(self, study: Study, population: Population, seed: int = 0):
         self._study, self._key, self._count = study, jax.random.key(seed), 0
@@ -60,7 +61,8 @@ class Decider:
         self._answer = jax.jit(lambda key, x: self._person.answer(key, x, jnp.asarray(0.5, x.dtype)))
 
     def __call__(self, trial: dict[str, Any], ask: str) -> str:
-        """The label for one question about a trial of the experimenter's view."""
+        """The answer to one question about a trial of the experimenter's view: for "preferred" the side that is nearest
+        to the optimum, else a random draw of a response ("class_a", "class_b")."""
         unit = {side: Rendering.of(self._study.space, values).unit for side, values in trial["renderings"].items()}
         if ask == "preferred":
             return min(unit, key=lambda side: self._distance(unit[side]))
@@ -69,13 +71,15 @@ class Decider:
         return self._study.responses[int(self._answer(key, jnp.asarray(unit[ask[-1]])))]
 
     def _distance(self, x):
+        """Distance of a point `x` (d,) of the unit cube from the participant's optimum, in tolerances."""
         away = simulate.felt_apart(self._person.levels, x, np.asarray(self._person.optimum))
         return float(np.linalg.norm(away / np.asarray(self._person.tolerance)))
 
 
 def fast_study(source: Path, target: Path, seconds: float | None, warm_up: int | None = None) -> Path:
-    """A copy of a study file, whose steps all last `seconds`. `warm_up`: how many trials of it, where the file has no
-    table for them."""
+    """Write a copy of a study file to `target`, in which every step lasts `seconds` (None: as it is), and return
+    `target`. Protocols that the file does not state are appended with such steps; an appended warm-up has `warm_up`
+    trials."""
     text = source.read_text(encoding="utf-8")
     if seconds is not None:
         text = re.sub(r"\bseconds\s*=\s*[\d.]+", f"seconds = {seconds}", text)
@@ -90,7 +94,8 @@ def fast_study(source: Path, target: Path, seconds: float | None, warm_up: int |
 
 
 def example_sets(study: Study, population: Population) -> dict[str, dict[str, float]]:
-    """Best, mid and worst renderings of a simulated population, by their distance from its truth."""
+    """Parameters of three renderings, "best", "mid" and "worst", by their distance from the truth of a simulated
+    population: of 256 candidates the nearest, the one a third of the way in that order, and the farthest."""
     space, points = study.space, study.space.candidates(256, 0)
     order = np.argsort(nrmse(points, Rendering.of(space, population.truth).unit, levels_of(space.parameters)))
     chosen = {"best": order[0], "mid": order[len(order) // 3], "worst": order[-1]}
@@ -99,7 +104,9 @@ def example_sets(study: Study, population: Population) -> dict[str, dict[str, fl
 
 @contextlib.contextmanager
 def server(*arguments: str, patience: float = 600.0) -> Iterator[tuple[subprocess.Popen, dict[str, str]]]:
-    """`hilbo session` as a process, and its links; told to end at the end. Raises `RuntimeError` with its words."""
+    """Run `hilbo session` with these arguments in a process, and yield the process and its links; terminate it at the
+    end, and kill it after 30 s. Raises `RuntimeError` with the end of its stderr if it does not start; it has
+    `patience` s to end then."""
     process = subprocess.Popen(
         [*HILBO, "session", *arguments, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -128,6 +135,7 @@ def server(*arguments: str, patience: float = 600.0) -> Iterator[tuple[subproces
 
 
 def _reader(file, words):
+    """A started thread that appends the lines of `file` to `words`."""
     import threading
 
     thread = threading.Thread(target=lambda: words.extend(file), daemon=True)
@@ -146,7 +154,14 @@ def rehearse(
     seed: int = 0,
     say: Callable[[str], Any] = lambda _: None,
 ) -> dict[str, Any]:
-    """The session's log, screenshots of both pages, and how long answers took to be felt, in `out`."""
+    """Run a session and return its summary: answers, duration, delays (ms), HOLDs cleared, JavaScript errors
+    (`mishaps`), names of screenshots, path of the log, number of events.
+
+    Writes study.toml, the log, screenshots of both pages, result.json with the summary, and for another phase than
+    optimisation plan.json into `out`. `seconds`: duration of every step, by default the study's; `preset`: population,
+    by default the study's. Raises `InputError` for a study that is refused, before `out` is made, and `RuntimeError` if
+    the server does not start.
+    """
     Study.load(source)  # what is refused leaves no folder behind
     out.mkdir(parents=True, exist_ok=True)
     file = fast_study(source, out / "study.toml", seconds, warm_up)
@@ -176,7 +191,8 @@ def rehearse(
 
 @contextlib.contextmanager
 def _by_device(arguments, decide):
-    """Links, what decides, and what makes a hand (given how to look at the session), with a simulated device."""
+    """Run the server with a simulated device; yields its links, `decide`, and a function that makes from `watch`
+    (returns the experimenter's view) what has the finger press (`_presser`)."""
     finger = Simulator(finger="rest")
     try:
         with server(*arguments, "--device", finger.port) as (_, links):
@@ -187,7 +203,8 @@ def _by_device(arguments, decide):
 
 @contextlib.contextmanager
 def _by_stand_in(study, arguments, decide):
-    """The same with who presents in place of a device."""
+    """As `_by_device`, with a stand-in that presents in place of a device: `decide` gets what it confirmed, and no
+    finger presses."""
     role = study.stimulus.role
     with server(*arguments) as (_, links), StandIn(study, links[role], role) as presents:
         yield (
@@ -198,7 +215,8 @@ def _by_stand_in(study, arguments, decide):
 
 
 def _plan(study, material, sets, phase, seed) -> Plan:
-    """Of one session, with one of the study's materials."""
+    """A plan of one session of participant P01, with one of the study's materials. `sets`: "best", "mid" and "worst",
+    which for aggregate-best become an aggregate and two individual sets."""
     if phase == "aggregate-best":
         sets = {"aggregate": sets["best"], "individual:S1": sets["mid"], "individual:S2": sets["worst"]}
     materials = () if material is None else (material,)
@@ -208,6 +226,8 @@ def _plan(study, material, sets, phase, seed) -> Plan:
 
 
 def _session(program, links, decide, touches, out, say) -> dict[str, Any]:
+    """Open both pages, act as the participant until the session ends, and return the first part of the summary of
+    `rehearse`; screenshots go to `out`/screens."""
     screens = out / "screens"
     screens.mkdir(exist_ok=True)
     desk = dict(zip(("width", "height"), SIZES[0], strict=True))
@@ -226,7 +246,7 @@ def _session(program, links, decide, touches, out, say) -> dict[str, Any]:
     begun = time.monotonic()
     cleared = _lead(participant, window, experimenter, screens, say)
     view = watch()
-    _watched(experimenter, participant, screens, "end")
+    _picture_experimenter(experimenter, participant, screens, "end")
     screenshots(window, screens, "participant-end")
     return {
         "answers": participant.answered,
@@ -240,26 +260,28 @@ def _session(program, links, decide, touches, out, say) -> dict[str, Any]:
 
 
 def _lead(participant, window, experimenter, screens, say) -> int:
-    """The participant acts until the session ends, with screenshots of what is new; how many HOLDs were cleared."""
+    """Act as the participant until the session ends, with a screenshot of each new phase and at some numbers of
+    answers; returns how many HOLDs were cleared."""
     taken: set[tuple[str, str]] = set()
     watched, cleared = {1, 4, 8}, 0
     while True:
-        _pictured(window, screens, taken)
+        _picture_participant(window, screens, taken)
         before = participant.answered
         phase = participant.act()
         if participant.answered > before:
             say(f"{participant.answered} answers")
         if participant.answered in watched:
             watched.remove(participant.answered)
-            _watched(experimenter, participant, screens, f"{participant.answered}-answers")
+            _picture_experimenter(experimenter, participant, screens, f"{participant.answered}-answers")
         if phase in ("done", "ended"):
             return cleared
-        cleared += phase == "wait" and _cleared(experimenter)
+        cleared += phase == "wait" and _clear_hold(experimenter)
         time.sleep(0.02)
 
 
-def _pictured(window, screens, taken) -> None:
-    """The participant's page, where it is in a phase or asks a question of which there is no picture yet."""
+def _picture_participant(window, screens, taken) -> None:
+    """Take a screenshot of the participant's page if its phase and question are not among `taken` yet, at most
+    `_PICTURES`."""
     seen = "[document.body.dataset.phase, document.querySelector('#options button') ? at('title').textContent : '']"
     if len(taken) >= _PICTURES or (mark := tuple(window.evaluate(seen))) in taken or mark[0] == "wait":
         return
@@ -270,8 +292,8 @@ def _pictured(window, screens, taken) -> None:
             screenshots(window, screens, f"participant-{len(taken)}-{phase}{'-question' if question else ''}")
 
 
-def _watched(experimenter, participant, screens, name) -> None:
-    """The experimenter's page, once it has heard of all the answers."""
+def _picture_experimenter(experimenter, participant, screens, name) -> None:
+    """Take a screenshot of the experimenter's page, once it shows all answers or after `_PATIENCE` s."""
     end = time.monotonic() + _PATIENCE  # of a page that hears nothing there is a picture too
     while not experimenter.evaluate(_HEARD, participant.answered) and time.monotonic() < end:
         time.sleep(0.05)
@@ -280,8 +302,9 @@ def _watched(experimenter, participant, screens, name) -> None:
         screenshots(experimenter, screens, f"experimenter-{name}", whole=True)
 
 
-def _cleared(experimenter) -> bool:
-    """A device that held on a busy computer is let go again, as the experimenter would."""
+def _clear_hold(experimenter) -> bool:
+    """Press Clear on the experimenter's page if it is shown, and return whether it was: a device may go to HOLD on a
+    busy computer."""
     if not experimenter.is_visible("#clear"):
         return False
     experimenter.evaluate("command('clear')")
@@ -289,7 +312,8 @@ def _cleared(experimenter) -> bool:
 
 
 def _presser(finger, watch) -> Callable[[bool], None]:
-    """Has the finger press while something is felt, and leave the handle after that."""
+    """A function that has the simulated finger press from its first call with True on, and leave the handle at the next
+    call with False."""
     pressing = False
 
     def feel(on):
@@ -304,7 +328,8 @@ def _presser(finger, watch) -> Callable[[bool], None]:
 
 
 def _let_go(finger, watch) -> None:
-    """The simulated finger leaves the handle out of contact: it taps, and rests where it is away."""
+    """Have the simulated finger tap and rest until the experimenter's view (`watch`) shows no contact, at most 50
+    times."""
     for _ in range(50):
         finger.tell("finger tap")
         time.sleep(0.28)

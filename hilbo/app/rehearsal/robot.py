@@ -1,8 +1,8 @@
-"""A simulated participant in a real browser: what `hilbo simulate --live` and the browser tests are driven by.
+"""A simulated participant in a real browser, for `hilbo simulate --live` and the browser tests.
 
-Chromium of this computer, without a window, is told by playwright what a person would do: open the link, press Begin,
-feel (the simulated device's finger presses while a rendering is shown), read the question, choose a button or a key.
-What it felt, the robot learns from the experimenter's JSON, which no participant has.
+Playwright drives the Chromium of this computer, without a window, as a person would: it opens the link, presses Begin,
+feels (the simulated device's finger presses while a rendering is presented), reads the question, and presses a key.
+What is presented it learns from the experimenter's JSON, which no participant has.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ _PATIENCE = 120_000  # ms
 
 
 def find_browser() -> str | None:
-    """Chromium or Chrome on this computer, if playwright is there to drive it."""
+    """Path of Chromium or Chrome on this computer; None without one, or without playwright to drive it."""
     import importlib.util
 
     if importlib.util.find_spec("playwright") is None:
@@ -43,7 +43,8 @@ def find_browser() -> str | None:
 
 @contextlib.contextmanager
 def browser() -> Iterator[Any]:
-    """A browser without a window and without a past. Raises `InputError` where there is none."""
+    """A browser without a window and with an empty profile, closed at the end. Raises `InputError` where `find_browser`
+    gives None."""
     program = find_browser()
     if program is None:
         raise InputError(
@@ -63,7 +64,8 @@ def browser() -> Iterator[Any]:
 
 
 class Client:
-    """A program with a role's key: the JSON interface, spoken with the standard library."""
+    """A program with a role's key, which uses the JSON interface with the standard library. To make one redeems the
+    link, which works once."""
 
     def __init__(self, link: str):
         self.address, _, token = link.partition("/#")
@@ -71,19 +73,21 @@ class Client:
         self._key = self.post("/api/join", {"token": token, "bearer": True})["key"]
 
     def get(self, path: str) -> Any:
-        """The answer to a GET."""
+        """The JSON response to a GET. Raises `urllib.error.HTTPError` for a status of an error."""
         return self._ask(urllib.request.Request(self.address + path, headers=self._headers()))
 
     def post(self, path: str, content: dict[str, Any]) -> Any:
-        """The answer to a POST."""
+        """The JSON response to a POST. Raises `urllib.error.HTTPError` for a status of an error."""
         body = json.dumps(content).encode()
         return self._ask(urllib.request.Request(self.address + path, data=body, headers=self._headers()))
 
     def _headers(self) -> dict[str, str]:
+        """Headers of a request, with the key once there is one."""
         return {"Content-Type": "application/json"} | ({"Authorization": f"Bearer {self._key}"} if self._key else {})
 
     @staticmethod
     def _ask(request: urllib.request.Request) -> Any:
+        """Send a request and return its JSON response; waits up to 60 s."""
         with urllib.request.urlopen(request, timeout=60) as reply:
             return json.load(reply)
 
@@ -91,8 +95,9 @@ class Client:
 class Participant:
     """The participant's page in a browser's window, and what a person does with it.
 
-    `decide(trial, ask)` gives the label to choose; `trial` is the pending one of the experimenter's view. `feel(on)` is
-    told when a rendering is shown.
+    `watch()` returns the experimenter's view; `decide(trial, ask)` the label to choose, for the pending trial of that
+    view; `feel(on)` is called with whether a rendering is presented. `answered` counts the answered trials. To make one
+    opens the link.
     """
 
     def __init__(
@@ -111,11 +116,12 @@ class Participant:
 
     @property
     def phase(self) -> str:
-        """Of the page."""
+        """The phase that the page shows, such as "step" or "answer"."""
         return self.window.evaluate("document.body.dataset.phase")
 
     def act(self) -> str:
-        """What a person would do now, if anything; the page's phase before."""
+        """Do what a person would do now: feel, answer the questions, press the button to go on, or nothing. Returns the
+        phase before that."""
         phase = self.phase
         self._feel(phase == "step" and self._rendering())
         if self.window.is_visible("#options"):
@@ -126,9 +132,12 @@ class Participant:
         return phase
 
     def _rendering(self) -> bool:
+        """Whether the page shows a step with a rendering, a or b."""
         return self.window.evaluate("!!(view && view.step && ['a', 'b'].includes(view.step.show))")
 
     def _answer(self) -> None:
+        """Answer all open questions by the number keys, each once the page accepts keys; stops if a question is gone,
+        and does nothing without a pending trial."""
         trial = self._pending()
         if trial is None:
             return
@@ -148,6 +157,7 @@ class Participant:
         self.answered += bool(names)
 
     def _pending(self) -> dict[str, Any] | None:
+        """The pending trial of the experimenter's view, or None."""
         whole = self._watch()["whole"]
         return next((t for t in whole["trials"] if t["id"] == whole["pending"]), None)
 
@@ -161,8 +171,8 @@ _GO_ON = "() => { draw = window.drawing; draw(); }"
 
 @contextlib.contextmanager
 def held(window: Any) -> Iterator[None]:
-    """The page stays as it is, whatever the server tells it meanwhile: what is read from it and pictures belong
-    together."""
+    """Within the block the page is not redrawn, whatever the server sends, so that what is read from it and its
+    screenshots agree."""
     window.evaluate(_HOLD)
     try:
         yield
@@ -171,7 +181,8 @@ def held(window: Any) -> Iterator[None]:
 
 
 def screenshots(window: Any, folder: Path, name: str, whole: bool = False) -> list[Path]:
-    """The page as every size of `SIZES` has it; `whole`: with what is below the screen's edge."""
+    """Write a PNG of the page at each size of `SIZES`, NAME-WIDTHxHEIGHT.png, and return the paths. `whole`: the full
+    page, beyond the window's edge. The window then has the first size."""
     made = []
     for width, height in SIZES:
         window.set_viewport_size({"width": width, "height": height})

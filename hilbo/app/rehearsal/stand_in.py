@@ -1,6 +1,6 @@
-"""In the place of the program, or of the person, that presents a study's renderings: it confirms whatever is asked for.
+"""A stand-in for the program or the person that presents a study's renderings: it confirms whatever it is ordered.
 
-`hilbo simulate --live` has it where a study has no device of ours, by the same messages as everybody's program
+`hilbo simulate --live` uses it for a study with [stimulus], by the messages of any such program
 (docs/guides/stimulus.md).
 """
 
@@ -23,7 +23,7 @@ _AGAIN = 0.1  # s until a server that did not take a report is asked again
 
 
 class StandIn:
-    """Joins by the link of `role`, and presents in a thread of its own until `close`."""
+    """Joins by the link of `role`, and confirms orders in a thread of its own until `close`."""
 
     def __init__(self, study: StudyFile, link: str, role: Role):
         self._study, self._client, self._path = study, Client(link), f"/api/{role}"
@@ -33,12 +33,12 @@ class StandIn:
         self._thread.start()
 
     def presented(self, trial: int) -> dict[str, Mapping[str, float]]:
-        """What was presented in a trial so far: side -> values as numbers, of levels their places in the study's
-        list."""
+        """What was confirmed in a trial so far: side -> values as numbers (a level as its index in the study's list);
+        empty for an unknown trial."""
         return self._presented.get(trial, {})
 
     def close(self) -> None:
-        """Leave the session."""
+        """Leave the session, and wait for the thread to end."""
         self._ended.set()
         self._thread.join()
 
@@ -49,6 +49,8 @@ class StandIn:
         self.close()
 
     def _present(self) -> None:
+        """The thread: say hello, then report on each order as soon as it comes; after an error of the connection, begin
+        again."""
         while not self._ended.is_set():
             with contextlib.suppress(OSError, http.client.HTTPException):  # not taken, or nobody is there
                 order = self._client.post(f"{self._path}/hello", _SAID)
@@ -58,7 +60,7 @@ class StandIn:
             self._ended.wait(_AGAIN)
 
     def _done(self, order: Mapping[str, Any]) -> dict[str, Any]:
-        """The report on an order that was followed to the letter."""
+        """The report that an order was carried out exactly; confirmed values are recorded for `presented`."""
         report: dict[str, Any] = {"order": order["order"], "state": "neutral"}
         if order["do"] == "present":
             report |= {"state": "presented", "trial": order["trial"]}
