@@ -1,10 +1,10 @@
 """Rig of a haptic device: a thread that runs jobs on the device one after the other and polls it ten times a second.
 
-Nothing here knows of trials or answers. A job gives a `Future`; whatever the device or the line does wrong is the job's
-`DeviceError`, and the snapshot that everybody may read says `lost` with the sentence; so it does of a device that has
-restarted, or hears no heartbeats. A lost device is tried again once a second; it comes back stopped. Sets go over to
-the device, and START is sent, out of contact only: both are tried again until the hand has left. START and CLEAR carry
-the count of stops that was known when they were requested, so that neither acts after a stop that came meanwhile.
+Nothing here knows of trials or answers. A job gives a `Future`; a fault of the device or the line is the `DeviceError`
+of the job, and sets `lost` of the snapshot; so does a device that has restarted, or receives no heartbeats. A lost
+device is tried again once a second; it comes back stopped. Sets are put in force, and START is sent, out of contact
+only: both are tried again until the hand has left. START and CLEAR carry the count of stops that was known when they
+were requested, so that neither acts after a stop that came meanwhile.
 """
 
 import asyncio
@@ -34,8 +34,9 @@ COUNTERS = ("holds", "estops", "overruns", "saturated", "slewed", "controlled", 
 
 
 class DeviceRig:
-    """A `Renderer` behind a queue, which renders a study's sets. `changed` is called in the rig's thread after every
-    look that found news, and `notice` with every sentence that the device told unasked."""
+    """Rig of a `Renderer`, which presents a study's sets. To make one calls `connect` and starts the thread. In that
+    thread, `changed` is called with each snapshot that differs from the last, `notice` with each sentence that the
+    device sends unasked."""
 
     title = "Device"
 
@@ -59,26 +60,29 @@ class DeviceRig:
         self._thread.start()
 
     def do(self, job: Callable[[Renderer], Any]) -> Future:
-        """Has `job(device)` done after those before it."""
+        """Queue `job(device)` for the rig's thread; its future has the result, or the exception: `DeviceError` while
+        the device is lost."""
         result: Future = Future()
         self._jobs.put((lambda: job(self._ready()), result))
         return result
 
     @property
     def words(self) -> str:
-        """Port of the device, and its damping."""
+        """Name of the device's line and its damping, as a text."""
         return f"{self.device.link.name}, damping {self.device.device.damping_N_s_per_m:.3g} N·s/m"
 
     async def prepare(self, showing: Showing) -> Loaded:
-        """Put the set of a rendering in force, once the handle is out of contact."""
+        """Wait until the handle is out of contact, put the set of a rendering in force, and return it. Raises
+        `DeviceError`."""
         wanted = self._wanted(showing)
         while (loaded := await asyncio.wrap_future(self.do(lambda device: self._load(device, wanted)))) is None:
             await asyncio.sleep(_NEAR)
         return loaded
 
     async def show(self, showing: Showing) -> None:
-        """Render the set in force once the handle is out of contact; a no-op if it is rendered already, and for the
-        reference, which is not rendered here."""
+        """Start to render the set in force once the handle is out of contact; nothing if it is rendered already, nor
+        for a step without a rendering (reference, neutral). Step 0 starts the count of the presentation's samples.
+        Raises `DeviceError`."""
         if showing.step == 0:
             self._counter.begin((showing.trial, showing.presentation))
         if showing.values is None:
@@ -88,24 +92,27 @@ class DeviceRig:
             await asyncio.sleep(_NEAR)
 
     def telemetry(self, trial: int, presentation: int) -> Mapping[str, int] | None:
-        """Counts of the samples since the first step of this presentation, up to the newest that has arrived."""
+        """Counts of the samples since the first step of this presentation of a trial, up to the newest that has
+        arrived; None for another presentation than the latest."""
         return self._counter.counts((trial, presentation))
 
     async def blank(self) -> None:
         """Do nothing: the set in force stays, and returns the handle when the hand leaves it."""
 
     async def rest(self) -> None:
-        """Stop the device; the order is sent even if the caller is cancelled."""
+        """Stop the device, and wait for that; the order is sent even if the caller is cancelled. Raises
+        `DeviceError`."""
         stopped = asyncio.wrap_future(self.do(self._stop))
-        stopped.add_done_callback(_looked_at)
+        stopped.add_done_callback(_retrieve_exception)
         await asyncio.shield(stopped)
 
     async def estop(self) -> None:
-        """Force to zero at once: overtakes everything that waits."""
+        """Force to zero at once, before all queued jobs, in a thread of its own. Raises `DeviceError`."""
         await asyncio.get_running_loop().run_in_executor(None, self.device.estop)
 
     async def clear(self) -> None:
-        """Go on after the hold or stop that was known when this was called, and after no later one.
+        """Leave the hold or stop that was known when this was called, but no later one, and wait for that. Raises
+        `DeviceError`.
 
         A STOP of this rig that was requested before, and acknowledged meanwhile, is no later one, unless the device
         counted another stop before it.
@@ -122,13 +129,14 @@ class DeviceRig:
         await asyncio.wrap_future(self.do(clear))
 
     def _stop(self, device: Renderer) -> None:
+        """Stop the device, and record its count of stops."""
         self._own_stops.append(device.stop())
 
     def hang_up(self) -> None:
         """Do nothing: no client waits for a device."""
 
     def close(self) -> None:
-        """Stop the device and let go of it."""
+        """End the thread, in at most 10 s, then stop the device and disconnect; errors of the device are ignored."""
         self._ending.set()
         self._jobs.put(None)
         self._thread.join(10)
@@ -136,20 +144,21 @@ class DeviceRig:
             self.device.close()
 
     def _wanted(self, showing: Showing) -> ParameterSet:
-        """The set of a rendering, with the memory and the period of its material's renderer."""
+        """The set of a rendering, with memory and sampling period of its material's renderer."""
         m, values = study_of(self._study, showing.material).space.mechanics, showing.values
         assert m is not None and values is not None  # a device renders, and a rendering
         numbers = (values[name] for name in ("K0", "K1", "B1", "alpha"))
         return ParameterSet(*numbers, N=m.N, T=m.T, memory=m.memory, states=m.states)
 
     def _ready(self) -> Renderer:
+        """The device. Raises `DeviceError` while it is lost."""
         if self.snapshot.lost:
             raise DeviceError(self.snapshot.lost)
         return self.device
 
     def _render(self, device: Renderer, stop: int) -> bool:
-        """Whether the set is rendered now; not while something touches the handle. `stop`: the count of stops when that
-        was requested."""
+        """Start to render unless the device renders already, and return True; False, without a start, while something
+        touches the handle. `stop`: the count of stops when this was requested. Raises `DeviceError`."""
         self._see(self._look())
         if self.snapshot.state == "RUNNING":
             return True
@@ -177,6 +186,8 @@ class DeviceRig:
         return Loaded({"in_force": in_force._asdict(), "serial_s": took}, took)
 
     def _work(self) -> None:
+        """The thread, until `close`: run the queued jobs, and poll the device when none is queued or the last poll was
+        longer ago than `_pause`."""
         looked = time.monotonic()
         while not self._ending.is_set():
             job, result = self._next()
@@ -186,24 +197,28 @@ class DeviceRig:
                 except BaseException as error:  # the waiting side's to judge
                     result.set_exception(error)
             if result is None or time.monotonic() - looked > self._pause:  # jobs may leave no pause between them
-                self._regularly()
+                self._poll()
                 looked = time.monotonic()
 
     @property
     def _pause(self) -> float:
+        """Time between two polls of the device, s; longer while it is lost."""
         return _RETRY if self.snapshot.lost else _POLL
 
     def _next(self) -> Any:
+        """The next job and its future, after at most `_pause` s; (None, None) if none came."""
         try:
             return self._jobs.get(timeout=self._pause) or (None, None)
         except queue.Empty:
             return None, None
 
-    def _regularly(self) -> None:
+    def _poll(self) -> None:
+        """Poll the device: new snapshot, samples, and the sentences that it sent. A `DeviceError` makes it lost; a lost
+        device is reconnected instead."""
         if self._ending.is_set():
             return
         if self.snapshot.lost:
-            self._again()
+            self._reconnect()
             return
         try:
             self._see(self._look())
@@ -213,8 +228,9 @@ class DeviceRig:
         except DeviceError as error:
             self._see(self.snapshot._replace(lost=str(error), state="LOST", contact=False))
 
-    def _again(self) -> None:
-        """Reconnect a lost device, which is then stopped and without a set."""
+    def _reconnect(self) -> None:
+        """Try to reconnect a lost device, which is then stopped and without a set; a simulator that has ended is
+        started anew. An error is the new `lost` of the snapshot."""
         try:
             if self.device.simulator is not None and not self.device.simulator.alive():
                 with contextlib.suppress(DeviceError):
@@ -227,6 +243,8 @@ class DeviceRig:
             self._see(self.snapshot._replace(lost=str(error)))
 
     def _look(self) -> Snapshot:
+        """A new snapshot, from the device's status. Raises `DeviceError`, also if the device has restarted or receives
+        no heartbeats."""
         status = self.device.status()
         if self.device.link.restarted or self.device.link.faint:  # which answer this question all the same
             self.device.limits()  # and no other: `DeviceError` with what has happened
@@ -248,6 +266,7 @@ class DeviceRig:
         )
 
     def _see(self, seen: Snapshot) -> None:
+        """Set the snapshot, and call `changed` if it differs from the last."""
         before, self.snapshot = self.snapshot, seen
         if seen != before:
             self._changed(seen)
@@ -260,7 +279,7 @@ def _reason(status: Status) -> str:
     return held_because(status.hold_reason)
 
 
-def _looked_at(done: asyncio.Future) -> None:
-    """Retrieve the exception of a future that may not be awaited."""
+def _retrieve_exception(done: asyncio.Future) -> None:
+    """Mark the exception of a future as retrieved, so that asyncio does not report it."""
     if not done.cancelled():
         done.exception()

@@ -1,6 +1,7 @@
-"""Orders to whoever presents a study's renderings, and how they are sent; docs/guides/stimulus.md has every key.
+"""Orders to the program or preparer that presents a study's renderings, and their messages; docs/guides/stimulus.md has
+every key.
 
-An order says what shall be the case from now on, not what shall change, so that nothing is lost with a message.
+An order states what is to be presented from now on, not a change, so that a lost message does no harm.
 """
 
 from typing import Any, NamedTuple
@@ -16,7 +17,8 @@ __all__ = ["Order", "as_sent", "parameters_of"]
 
 
 class Order(NamedTuple):
-    """What shall be the case. `do`: present, neutral or stop; `trial`: a name for the trial that is presented."""
+    """An order. `do`: "present", "neutral" or "stop"; `trial`: name of the trial that is presented; `showing`: the
+    step."""
 
     number: int
     do: str
@@ -25,7 +27,8 @@ class Order(NamedTuple):
 
 
 def as_sent(order: Order, study: StudyFile, tag: str) -> dict[str, Any]:
-    """The message that gives an order; `tag` is what trials of the session are known by."""
+    """The message of an order, as a dict for JSON; only the number and `do` where nothing is presented. `tag`: makes
+    the labels of renderings those of this session."""
     assert study.stimulus is not None  # nobody else is given orders
     showing = order.showing
     message: dict[str, Any] = {"order": order.number, "do": order.do}
@@ -44,12 +47,14 @@ def as_sent(order: Order, study: StudyFile, tag: str) -> dict[str, Any]:
 
 
 def parameters_of(study: StudyFile) -> list[dict[str, Any]]:
-    """What the parameters of orders may be, and how far off a confirmation may be, in their units. On a logarithmic
-    scale, where that grows with the value, it is told for the low end, and as a share."""
+    """The parameters of orders, one dict each: levels, or range, unit and tolerance of a confirmation in that unit. On
+    a logarithmic scale, where it grows with the value, the tolerance is that at the low end, and `share` is
+    relative."""
     return [_parameter(study, p) for p in study.space.parameters]
 
 
 def _parameter(study: StudyFile, p: Parameter) -> dict[str, Any]:
+    """One parameter of `parameters_of`."""
     assert study.stimulus is not None
     if p.levels:
         return {"name": p.name, "levels": list(p.levels)}

@@ -1,8 +1,8 @@
-"""What shows renderings to a participant, whatever it is: a device of ours (`device_rig`), or a program with a link of
-its own (`stimulus_rig`).
+"""What presents renderings to a participant, whatever it is: a haptic device (`device_rig`), or a program or person
+with a link (`stimulus_rig`).
 
-A rig knows nothing of answers. It makes a rendering ready, shows it, rests, stops; what it says of itself is a
-`Snapshot`, and it tells of each new one. The runner leads a trial through either in the same way.
+A rig knows nothing of answers. It prepares a rendering, shows it, rests, stops; its state is a `Snapshot`, and it
+reports each new one. The runner leads a trial through any of them in the same way.
 """
 
 from collections.abc import Mapping
@@ -14,11 +14,12 @@ __all__ = ["Loaded", "MissedError", "Rig", "Showing", "Snapshot"]
 
 
 class Snapshot(NamedTuple):
-    """What was last seen of a rig.
+    """The last known state of a rig.
 
-    `state`: RUNNING, STOPPED, HOLD, ESTOP or LOST. `lost`: why there is none, None while there is one. `reason`: why it
-    holds. `facts`: what of it goes into the log. `rows`: what the experimenter sees of it, names and values. `excused`:
-    it is as it is because no server spoke to it, which is no fault of the trial that was begun.
+    `state`: RUNNING, STOPPED, HOLD, ESTOP or LOST. `contact`: something touches it. `lost`: why it is not available,
+    None while it is. `reason`: why it is in HOLD or ESTOP. `facts`: what the log gets of it. `rows`: what the
+    experimenter sees of it, names and values. `excused`: its state comes from a time without a server, so that it voids
+    no trial.
     """
 
     state: str
@@ -31,8 +32,8 @@ class Snapshot(NamedTuple):
 
 
 class Showing(NamedTuple):
-    """What is shown in a step of a trial. `values`: of a rendering, parameters in physical units; None for the
-    reference and for a neutral interval."""
+    """A request to show a step of a trial. `presentation`: how often the trial has begun; `values`: parameters of a
+    rendering in physical units; None for the reference and a neutral interval."""
 
     trial: int
     presentation: int
@@ -43,20 +44,20 @@ class Showing(NamedTuple):
 
 
 class Loaded(NamedTuple):
-    """A rendering in force: what the log holds of that, and how long (s) the rig took, without the wait for a hand."""
+    """A rendering in force: its facts for the log, and how long (s) the rig took, without the wait for a hand."""
 
     facts: dict[str, Any]
     took_s: float
 
 
 class MissedError(RuntimeError):
-    """What was asked for was not presented: the trial is void."""
+    """What was requested was not presented: the trial is void."""
 
 
 @runtime_checkable
 class Rig(Protocol):
-    """What shows renderings. `notes`: what to tell whoever started it. `simulated`: nothing moves. Whatever fails is a
-    RuntimeError with a sentence."""
+    """What presents renderings. `notes`: what to tell the person who started it. `simulated`: nothing moves. Every
+    failure is a RuntimeError with a sentence."""
 
     title: str
     simulated: bool
@@ -65,21 +66,22 @@ class Rig(Protocol):
 
     @property
     def words(self) -> str:
-        """What it is, for the experimenter."""
+        """What it is, in words, for the experimenter."""
         ...
 
     async def prepare(self, showing: Showing) -> Loaded | None:
-        """Make a rendering ready while something else is shown. `Loaded` if it is in force by that; None if it will be
-        when it is shown. A rig that touches the hand waits here, and in `show`, until the hand has left."""
+        """Prepare a rendering while something else is presented. `Loaded` if it is then in force; None if it comes in
+        force with `show`. A rig that touches the hand waits here, and in `show`, until the hand has left."""
         ...
 
     async def show(self, showing: Showing) -> Loaded | None:
-        """Show it from now on; returns once it is shown. Raises `MissedError`."""
+        """Present a step from now on; returns once it is presented, with `Loaded` if that put a rendering in force.
+        Raises `MissedError`."""
         ...
 
     def telemetry(self, trial: int, presentation: int) -> Mapping[str, int] | None:
-        """Counts of the samples since this presentation of a trial began: `samples`, and those with a flag of
-        `hilbo.study.file.trial_flags` by its name, where there are any. None where no telemetry was recorded."""
+        """Counts of the samples since this presentation of a trial began: `samples`, and for each flag of
+        `hilbo.study.file.trial_flags` that occurred the samples with it. None where no telemetry was recorded."""
         ...
 
     async def blank(self) -> None:
@@ -91,11 +93,11 @@ class Rig(Protocol):
         ...
 
     async def estop(self) -> None:
-        """Stop at once, overtaking everything; returns once that is acknowledged."""
+        """Stop at once, before all other requests; returns once that is acknowledged."""
         ...
 
     async def clear(self) -> None:
-        """Leave a hold or a stop."""
+        """Leave HOLD or ESTOP."""
         ...
 
     def hang_up(self) -> None:
@@ -103,5 +105,5 @@ class Rig(Protocol):
         ...
 
     def close(self) -> None:
-        """Stop, and let go."""
+        """Stop, and release the device."""
         ...

@@ -1,4 +1,4 @@
-"""Counts of the flagged telemetry samples of a trial, while it is felt."""
+"""Counts of the flagged telemetry samples of a trial, while it is presented."""
 
 import threading
 from collections.abc import Callable, Mapping
@@ -15,11 +15,11 @@ _BITS = {name: int(SampleFlag[name.upper()]) for name in FLAGS}
 
 
 class SampleCounter:
-    """Counts of the presentation that began last. `take` gives the flags of all samples that have arrived since it was
-    called last.
+    """Counts of the presentation that began last. `take()` gives the flags (n,) of all samples that arrived since its
+    last call.
 
-    The thread of the device drains it regularly, so that nothing piles up, and the event loop reads it with an answer.
-    Samples are taken and counted under one lock: none of an earlier presentation is counted with a later one.
+    The thread of the device drains it regularly, so that no samples pile up, and the event loop reads it with an
+    answer. Samples are taken and counted under one lock: none of an earlier presentation is counted with a later one.
     """
 
     def __init__(self, take: Callable[[], np.ndarray]):
@@ -28,7 +28,8 @@ class SampleCounter:
         self._counts: dict[str, int] = {}
 
     def begin(self, of: Any) -> None:
-        """Count for this presentation from now on, from zero."""
+        """Count from zero for this presentation from now on; `of` identifies it, (trial, presentation). Samples that
+        arrived before are dropped."""
         with self._lock:
             self._take()
             self._of, self._counts = of, {SAMPLES: 0}
@@ -39,12 +40,14 @@ class SampleCounter:
             self._add()
 
     def counts(self, of: Any) -> Mapping[str, int] | None:
-        """`samples`, and the samples with each flag that occurred; None for a presentation that is not counted."""
+        """Number of all `samples`, and for each flag that occurred of the samples with it, including those that have
+        just arrived; None for another presentation than the latest."""
         with self._lock:
             self._add()
             return dict(self._counts) if of == self._of else None
 
     def _add(self) -> None:
+        """Take the new samples and count them, if a presentation has begun. The caller holds the lock."""
         flags = self._take()
         if self._of is None or not len(flags):
             return

@@ -19,8 +19,8 @@ _OFTEN = 5  # renderings, and stops in them
 
 
 class Measured(NamedTuple):
-    """What the program said of itself, and how long it took: s until a rendering was confirmed, and until a stop was
-    acknowledged, each time; `why` it went wrong, or ""."""
+    """Result of a check: the program's name and version in words (`words`), times (s) until each rendering was
+    confirmed and until each stop was acknowledged, and why the check failed, or ""."""
 
     words: str
     presented: tuple[float, ...]
@@ -29,8 +29,8 @@ class Measured(NamedTuple):
 
 
 class StimulusCheck:
-    """In the place of a hub, for `serve`. It waits `patience` s for the program; `done` is called in the end, once
-    `measured` is there."""
+    """In the place of a hub, for `serve`. It waits `patience` s for the program to join; `measured` is None until the
+    check is over."""
 
     def __init__(self, study: StudyFile, patience: float):
         self.rig = StimulusRig(study, "check")
@@ -41,7 +41,7 @@ class StimulusCheck:
         self._task: asyncio.Task | None = None
 
     def begin(self, done: Callable[[], Any]) -> None:
-        """What `serve` calls when it listens."""
+        """Start to measure, in the running event loop; `done` is called when `measured` is set."""
         self._done = done
         self._task = asyncio.get_running_loop().create_task(self._measure())
 
@@ -54,14 +54,16 @@ class StimulusCheck:
             self._task.cancel()
 
     def text(self, key: str) -> str:
-        """What participants read, in the study's language."""
+        """The participant's text for a key, in the study's own words or language."""
         return self._study.session.text(key)
 
     def hang_up(self) -> None:
-        """Answer all waiting requests."""
+        """End all waiting requests of the program."""
         self.rig.hang_up()
 
     async def _measure(self) -> None:
+        """Have renderings presented and stopped, `_OFTEN` times, set `measured`, and call `done`. An error of the rig
+        ends it, and is its `why`."""
         presented: list[float] = []
         stopped: list[float] = []
         why = ""
@@ -86,13 +88,14 @@ class StimulusCheck:
             await asyncio.sleep(0.02)
 
     def _middle(self, number: int) -> Showing:
-        """The rendering in the middle of all ranges."""
+        """A request for the rendering in the middle of all ranges, in trial `number` + 1."""
         middles = ((p, p.middle) for p in self._study.space.parameters)
         values = {p.name: float(round(middle)) if p.discrete else middle for p, middle in middles}
         return Showing(number + 1, 1, 0, "a", values, None)
 
     @staticmethod
     async def _timed(work: Any) -> float:
+        """Await `work`, and return how long it took, s."""
         begun = time.perf_counter()
         await work
         return time.perf_counter() - begun

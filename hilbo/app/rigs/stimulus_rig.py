@@ -1,10 +1,9 @@
-"""A rig that is a program with a link of its own, or a person with the preparer's page: what it is told, what it says,
-and when it is not believed.
+"""A rig that is a program with a link of its own, or a person with the preparer's page: orders to it, and its reports.
 
     program --> hello, then reports --> this rig --> orders, one at a time, each with a number of its own
 
-Whoever asks is told the newest order (`orders`). The program says which order it knows and what it has done about it;
-it asks again and again, which is its sign of life, and the answer is the server's. All of it happens in the event loop.
+The response to each message is the newest order (`orders`). The program reports which order it knows and what it has
+done about it; it reports again and again, which is its sign of life. All of it happens in the event loop.
 docs/guides/stimulus.md has every message.
 """
 
@@ -38,17 +37,17 @@ _PART = 3  # a question is held for so small a part of the silence that is borne
 
 
 class OverError(InputError):
-    """A report that is not taken, and not because it was not understood: it came late, twice, or from another run.
+    """A report that is refused though it was understood: it came late, twice, or from another run.
 
-    `standing`: the order that stands, where the run is the right one.
+    `standing`: the current order as a message, where the run is the right one; else empty.
     """
 
     standing: Mapping[str, Any] = {}
 
 
 class StimulusRig:
-    """The program that presents a study's renderings. `changed` is told of each new snapshot; `tag` is what trials of
-    the session are known by."""
+    """The program or person that presents a study's renderings. `changed` is called with each new snapshot; `tag` is
+    the prefix of the trials' names."""
 
     simulated = False
 
@@ -80,7 +79,7 @@ class StimulusRig:
 
     @property
     def words(self) -> str:
-        """Name, version and force of the program, in words."""
+        """Name, version and force of the program, and how fast it stopped, in words."""
         said = self._hello
         if self.role == "preparer":
             return "a person presents, by hand"
@@ -92,11 +91,11 @@ class StimulusRig:
     # What the program says.
 
     async def hello(self, hello: Hello, key: str = "") -> dict[str, Any]:
-        """A program begins with a key; the one before, if there is one, is out. Whoever moves something is stopped
-        first, to see how long that takes.
+        """Accept a program that joins with a `key`, in place of any other, and return the new run, the limits, the
+        parameters and the first order: a stop, whose duration is measured.
 
-        Raises `OverError` while another program with this key is heard: each would be back at once after the other. A
-        page is taken over whenever a person asks for it.
+        Raises `OverError` while another program with the same key is heard: each would be back at once after the other.
+        A preparer's page can always be replaced.
         """
         another = self.role == "stimulus" and key == self._key and hello.run != self._run
         if self._run and another:
@@ -112,16 +111,18 @@ class StimulusRig:
         return {"run": self._run, **limits, **study, **self._current_order()}
 
     async def free(self) -> bool:
-        """Whether no program presents; waits at most as long as a program may be silent."""
+        """Whether no program presents; waits for the present one to fall silent, at most as long as it may be silent,
+        and 5 s."""
         end = time.monotonic() + min(self._table.silence + _TURN, _WAIT)
         while self._run and (left := end - time.monotonic()) > 0:
             await self._wait_for(self._moved, left)
         return not self._run
 
     async def report(self, report: Report) -> dict[str, Any]:
-        """What the program says; the newest order, as soon as there is one that it does not know, or it has waited.
+        """Apply a program's report, and return the current order as a message: at once if the program does not know it,
+        else when there is a newer one, or after the report's `wait_s` (at most a third of the silence allowed).
 
-        Raises `OverError`, `InputError`.
+        Raises `OverError`; one about the order is also shown to the experimenter.
         """
         if not self._run or report.run != self._run:
             raise OverError("This run is not the one that presents; say hello first, or end.")
@@ -139,7 +140,8 @@ class StimulusRig:
         return self._current_order()
 
     def _apply(self, report: Report) -> None:
-        """Apply a report: contact, and the state of the current order. Raises `OverError`."""
+        """Apply a report: contact, and the state of the current order. Raises `OverError` for an order that is not
+        there yet, or a confirmation that comes too late or does not fit."""
         order = self.order
         if report.order > order.number:
             raise OverError(f"There is no order {report.order} yet; the newest is {order.number}.")
@@ -156,6 +158,9 @@ class StimulusRig:
             self._reject(f"failed: {report.why or 'the program does not say why'}")
 
     def _confirm(self, order: Order, report: Report) -> None:
+        """Accept that the order's step is presented, which ends `show`; the same confirmation again changes nothing. A
+        value beyond the tolerance fails `show`. Raises `OverError` for that, and for all that does not fit the
+        order."""
         if order.do != "present" or order.showing is None:
             raise OverError(f"Order {order.number} is {order.do}; there is nothing to present.")
         if report.trial != order.trial:
@@ -200,13 +205,14 @@ class StimulusRig:
         self._moved.set()
 
     def _reject(self, why: str) -> None:
+        """Fail the confirmation that `show` awaits with `MissedError`, which voids the trial."""
         if self._confirmation is not None and not self._confirmation.done():
             self._confirmation.set_exception(MissedError(why))
 
     # What the session wants.
 
     async def prepare(self, showing: Showing) -> None:
-        """Do nothing: a program is ordered when it is to present, and not before."""
+        """Do nothing, and return None: a program is ordered when it is to present, and not before."""
 
     def telemetry(self, trial: int, presentation: int) -> None:
         """None: a program sends no telemetry."""
@@ -214,8 +220,8 @@ class StimulusRig:
     async def show(self, showing: Showing) -> Loaded | None:
         """Order a step and wait for its confirmation; a program that exerts force is ordered once nothing touches it.
 
-        None for a neutral step or one without values. Raises MissedError, and orders neutral, if no confirmation comes
-        in time.
+        None for a neutral interval and for the reference. Raises `MissedError`, and orders neutral, if the confirmation
+        does not come in time or is off; `RuntimeError` if the program is lost or stopped.
         """
         self._check_present()
         if showing.show == "neutral":
@@ -241,14 +247,15 @@ class StimulusRig:
         return None if showing.values is None else confirmed
 
     async def blank(self) -> None:
-        """Order the neutral state during the response."""
+        """Order the neutral state, if a step is presented."""
         if self.order.do == "present":
             self._order("neutral")
 
     rest = blank
 
     async def estop(self) -> None:
-        """Order a stop and wait for its acknowledgement. Raises `RuntimeError` if that does not come in time."""
+        """Order a stop and wait for its acknowledgement. Raises `RuntimeError` if no program is there, or that does not
+        come in time."""
         if self.snapshot.lost:
             raise RuntimeError(self.snapshot.lost)
         assert self._hello is not None
@@ -266,7 +273,7 @@ class StimulusRig:
             await self._wait_for(self._moved, end - time.monotonic())
 
     async def clear(self) -> None:
-        """Leave an acknowledged stop. Raises `RuntimeError` before the acknowledgement."""
+        """Leave an acknowledged stop. Raises `RuntimeError` before the acknowledgement, or if no program is there."""
         self._check_present()
         if self.snapshot.state == "ESTOP":
             if self._stop_s is None:
@@ -275,7 +282,7 @@ class StimulusRig:
             self._order("neutral")
 
     def hang_up(self) -> None:
-        """Order the neutral state, and cancel all timers."""
+        """Order the neutral state, which ends waiting requests, and cancel all timers."""
         self._ended = True
         self._order("neutral")
         for what in list(self._timers):
@@ -287,7 +294,8 @@ class StimulusRig:
     # How long things may take.
 
     def _order(self, do: str, showing: Showing | None = None, trial: str = "") -> None:
-        """Give the next order; a program with force must report the neutral state in time."""
+        """Give the next order; a program with force, or one told to stop, is dropped unless it reports neutral in
+        time."""
         if self.order.do != "present" or do != "present":
             self._cancel_timer("neutral")
         self._replace_order(Order(self.order.number + 1, do, showing, trial))
@@ -297,17 +305,20 @@ class StimulusRig:
             self._start_timer("neutral", program.neutral_within_s + _TRAVEL, words)
 
     def _restart_silence(self) -> None:
+        """Restart the timer that drops a silent program."""
         said = self._hello
         words = f"{said.name if said else 'The program'} has been silent for {self._table.silence:g} s."
         self._start_timer("silence", self._table.silence, words)
 
     def _start_timer(self, what: str, seconds: float, words: str) -> None:
-        """Drop the program after `seconds` unless the timer `what` is cancelled before."""
+        """Drop the program after `seconds`, for the reason `words`, unless the timer `what` is cancelled or restarted
+        before."""
         self._cancel_timer(what)
         if not self._ended:
             self._timers[what] = asyncio.get_running_loop().call_later(seconds, self._drop_program, words)
 
     def _cancel_timer(self, what: str) -> None:
+        """Cancel the timer `what`, if it runs."""
         timer = self._timers.pop(what, None)
         if timer is not None:
             timer.cancel()
@@ -324,7 +335,7 @@ class StimulusRig:
         )
 
     def _abort_confirmation(self, words: str) -> None:
-        """Fail the pending confirmation without voiding the trial."""
+        """Fail the confirmation that `show` awaits with `RuntimeError`, which voids no trial."""
         if self._confirmation is not None and not self._confirmation.done():
             self._confirmation.set_exception(RuntimeError(words))
 
@@ -335,15 +346,18 @@ class StimulusRig:
         self._news = asyncio.Event()
 
     def _check_present(self) -> None:
+        """Raise `RuntimeError` while no program is there."""
         if self.snapshot.lost:
             raise RuntimeError(self.snapshot.lost)
 
     async def _wait_for(self, event: asyncio.Event, seconds: float = 1.0) -> None:
+        """Clear the event, and wait until it is set, at most `seconds`."""
         event.clear()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(event.wait(), seconds)
 
     def _update(self, seen: Snapshot) -> None:
+        """Set the snapshot, with rows for the experimenter, and call `changed` if it differs from the last."""
         rows = (("Contact", "yes" if seen.contact else "no"),) if self._has_force else ()
         seen = seen._replace(rows=(*rows, ("Refused", self._refused)) if self._refused else rows)
         before, self.snapshot = self.snapshot, seen
@@ -353,6 +367,7 @@ class StimulusRig:
 
     @property
     def _has_force(self) -> bool:
+        """Whether the program says that it exerts force; False before one has joined."""
         return self._hello is not None and self._hello.force
 
     def _current_order(self) -> dict[str, Any]:
@@ -360,5 +375,6 @@ class StimulusRig:
         return as_sent(self.order, self._study, self._tag)
 
     def _program_facts(self) -> dict[str, Any]:
+        """Name, version and force of the program for the log; empty before the first has joined."""
         program = self._hello
         return {} if program is None else {"program": program.name, "version": program.version, "force": program.force}

@@ -23,7 +23,7 @@ _BACKLOG = 1024  # those that wait for it in the kernel
 
 class Listener:
     """Accepts the connections of a listening socket. `admit` is called with each admitted connection and the role whose
-    key came with it, if any; at most `most` connections are pending."""
+    key came with it, or None; at most `most` connections are pending."""
 
     def __init__(
         self, listening: socket.socket, gate: Gate, most: int, admit: Callable[[socket.socket, Role | None], Any]
@@ -34,7 +34,7 @@ class Listener:
         self._queues = RoundRobin(self._admit_line)  # of those that have sent something
 
     def open(self) -> None:
-        """Start accepting, in the running event loop."""
+        """Listen and start to accept, in the running event loop."""
         self._loop = asyncio.get_running_loop()
         self._listening.setblocking(False)
         self._listening.listen(_BACKLOG)
@@ -42,13 +42,14 @@ class Listener:
         self._clock = self._loop.call_later(1.0, self._tick)
 
     def close(self) -> None:
-        """Stop accepting, and close the pending connections."""
+        """Stop accepting, and close the pending connections; the listening socket stays open."""
         self._clock.cancel()
         self._loop.remove_reader(self._listening)
         for line in list(self._pending):
             self._close_connection(line)
 
     def _accept(self) -> None:
+        """Accept the waiting connections, at most `_AT_ONCE`; each is inspected, or watched until it sends data."""
         for _ in range(_AT_ONCE):
             try:
                 line, _ = self._listening.accept()
@@ -70,11 +71,13 @@ class Listener:
             self._close_connection(next(iter(self._pending)))
 
     def _readable(self, line: socket.socket) -> None:
+        """Callback when a watched connection has data or has ended: inspect it."""
         self._unwatch(line)
         self._inspect(line)
 
     def _inspect(self, line: socket.socket) -> bool:
-        """Whether data have come; then the connection is admitted, queued, or closed."""
+        """Whether data have come, or the connection has ended. With data it is admitted (the experimenter's) or queued
+        by its role; without, it is closed."""
         try:
             said = line.recv(LOOKED, socket.MSG_PEEK)
         except BlockingIOError:
@@ -91,25 +94,30 @@ class Listener:
         return True
 
     def _admit_line(self, line: socket.socket, role: Role | None) -> None:
+        """Admit a connection, which is then no longer pending."""
         self._forget(line)
         self._admit(line, role)
 
     def _close_connection(self, line: socket.socket) -> None:
+        """Close a connection and remove it everywhere."""
         self._forget(line)
         self._unwatch(line)
         with contextlib.suppress(OSError):
             line.close()
 
     def _unwatch(self, line: socket.socket) -> None:
+        """Stop watching a connection that has sent nothing, if it is watched."""
         if line in self._silent:
             self._silent.remove(line)
             self._loop.remove_reader(line.fileno())
 
     def _forget(self, line: socket.socket) -> None:
+        """Remove a connection from the pending ones and the queues."""
         self._pending.pop(line, None)
         self._queues.remove(line)
 
     def _tick(self) -> None:
+        """Close the connections that were pending for too long; once a second."""
         now = self._loop.time()
         for line in [line for line, until in self._pending.items() if until < now]:
             self._close_connection(line)

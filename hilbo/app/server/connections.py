@@ -37,7 +37,7 @@ class Connections:
         self._queues = RoundRobin(lambda connection, _: connection.process())
 
     def add(self, connection: "Connection") -> None:
-        """Add a connection, new or with a new role; the oldest of too many is closed."""
+        """Add a connection, new or with a new role; if its role has too many, the oldest is closed."""
         mine = self._open[connection.role]
         mine[connection] = None
         if len(mine) > _MOST[connection.role]:
@@ -46,12 +46,12 @@ class Connections:
             oldest.abort()
 
     def remove(self, connection: "Connection") -> None:
-        """Remove a connection that has ended, or changes its role."""
+        """Remove a connection that has ended, or changes its role, from its role and its queue; it is not closed."""
         self._open[connection.role].pop(connection, None)
         self._queues.remove(connection)
 
     def wait(self, connection: "Connection") -> None:
-        """Queue it to be served."""
+        """Have its data processed: at once for the experimenter, else when its queue comes to it."""
         if connection.role == "experimenter":
             connection.process()
         else:
@@ -59,7 +59,8 @@ class Connections:
 
 
 class Connection(H11Protocol):
-    """One connection, which reads no more data before those it has were processed. `role` is that of the first key."""
+    """One connection, which reads no more data before those it has were processed. `role`: that of the newest key in
+    its data, None for a stranger. Its methods are called by asyncio and uvicorn."""
 
     def __init__(self, others: Connections, role: Role | None = None, **uvicorns: Any):
         super().__init__(**uvicorns)
@@ -70,20 +71,21 @@ class Connection(H11Protocol):
         self._limit: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
-        """The connection begins."""
+        """The connection begins: it is counted, and its timer starts."""
         super().connection_made(transport)
         self._others.add(self)
         self._start_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection has ended."""
+        """The connection has ended: it is no longer counted."""
         self._others.remove(self)
         self._stop_timer()
         self._unset_keepalive_if_required()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Keep the data until the connection is served, and look for a key."""
+        """Keep the data until the connection is served, and take on the role of a key in them; close a connection with
+        more than `LARGEST` bytes in a request."""
         self._size += len(data)
         if self._size > LARGEST:
             self.abort()
@@ -100,7 +102,7 @@ class Connection(H11Protocol):
         self._others.wait(self)
 
     def process(self) -> None:
-        """Process the data as HTTP."""
+        """Process the data received so far as HTTP; called when it is the connection's turn."""
         if self.transport.is_closing():
             return
         data, self._unprocessed = self._unprocessed, b""
@@ -111,21 +113,21 @@ class Connection(H11Protocol):
         if self.cycle is not None:
             usual = self.server_state.default_headers
             self.cycle.default_headers = usual if self.role else [*usual, CLOSE_HEADER]
-        if not self.flow.read_paused and (self.role is not None or self._begun()):
+        if not self.flow.read_paused and (self.role is not None or self._incomplete()):
             self.transport.resume_reading()
-        if self._begun():
+        if self._incomplete():
             self._start_timer()
         elif self.role is not None:
             self._stop_timer()
 
     def handle_events(self) -> None:
-        """A further request that came with the one answered is queued like any other."""
+        """After a response: queue a further request that came with the one answered, like any other."""
         if self._unprocessed or self.conn.trailing_data[0]:
             self.transport.pause_reading()
             self._others.wait(self)
 
     def on_response_complete(self) -> None:
-        """The size of a role's next request is counted from here."""
+        """Reset the count of bytes for a role's next request, and keep its connection open for `_KEPT` s."""
         if self.role is not None:
             self._size = 0
             self.timeout_keep_alive = _KEPT
@@ -142,21 +144,22 @@ class Connection(H11Protocol):
             self.abort()
 
     def shutdown(self) -> None:
-        """The server ends: incomplete requests are dropped."""
-        if self._begun():
+        """The server ends: close at once if a request is incomplete or none has begun, else after the response."""
+        if self._incomplete():
             self.abort()
         else:
             super().shutdown()
 
     def abort(self) -> None:
-        """Close the connection at once."""
+        """Close the connection at once, without a response."""
         self.transport.abort()
 
-    def _begun(self) -> bool:
+    def _incomplete(self) -> bool:
         """Whether a request is incomplete, or none has begun."""
         return self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
 
     def _start_timer(self) -> None:
+        """Close the connection after `PATIENCE` s, unless the timer runs already or is stopped before."""
         if self._limit is None:
             self._limit = self.loop.call_later(PATIENCE, self.abort)
 

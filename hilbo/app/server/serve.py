@@ -1,7 +1,7 @@
 """Starting and ending the server of a session: address, links, QR codes, signals.
 
-The socket is bound before anything slow happens, so that a port in use is said at once; nobody is answered before the
-hub is open.
+The socket is bound before anything slow happens, so that a port in use is reported at once; requests are answered once
+the hub is open.
 """
 
 import asyncio
@@ -28,7 +28,8 @@ _RESERVED = 160  # of them for connections that are served, the device, the log
 
 
 class Place:
-    """Where a session is served: a bound socket, its gate, and links to hand out."""
+    """Where a session is served: a bound `socket`, its `gate` (keys are kept in the file `keys`), and links.
+    `addresses`: of this computer in its networks, empty for a server that only this computer reaches."""
 
     def __init__(self, listening: socket.socket, addresses: list[str], keys: Path | None):
         number = listening.getsockname()[1]
@@ -38,18 +39,19 @@ class Place:
         self.gate = Gate(self.hosts, keys)
 
     def link(self, role: Role) -> str:
-        """A one-time link for a role. The experimenter's is for this computer, the others' for the network where there
-        is one."""
+        """A new one-time link for a role, which voids the role's earlier unused one. The experimenter's is for this
+        computer, the others' for the network if the server is in one."""
         host = self._near if role == "experimenter" else self._far
         return f"http://{host}/#{self.gate.invite(role)}"
 
     def links(self, roles: Iterable[Role] = ("participant", "experimenter")) -> dict[str, str]:
-        """One link for each of the roles."""
+        """Role -> a new link, for each of the roles."""
         return {role: self.link(role) for role in roles}
 
 
 def bound(port: int = PORT, *, lan: bool = False, keys: Path | None = None) -> Place:
-    """A socket that nobody else uses. Only this computer reaches it, with `lan` its networks too.
+    """Bind a socket to a port that no other program uses. Only this computer reaches it, with `lan` its networks too;
+    port 0 is any free one; `keys` is the file of the keys.
 
     Raises `InputError` if the port is in use, or there is no network.
     """
@@ -71,10 +73,10 @@ def bound(port: int = PORT, *, lan: bool = False, keys: Path | None = None) -> P
 
 
 def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any], tried: Any = None) -> None:
-    """Opens the hub, answers until Ctrl-C or SIGTERM, or until what `started` was given is called, and closes the hub.
-    `tried`: what the page of `hilbo try` is told, where this is one (`tried`).
+    """Open the hub, call `started(stop)`, answer requests until Ctrl-C, SIGTERM or a call of `stop`, then close the hub
+    and the socket. `tried`: makes the data of the page of `hilbo try` (`Tried`), for that command.
 
-    Raises what keeps the hub from opening, `InputError` or `DeviceError`; nobody has been answered then.
+    Raises what keeps the hub from opening, `InputError` or `DeviceError`; no request has been answered then.
     """
     from hilbo.app.server.admission import Listener
 
@@ -92,7 +94,7 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any], 
 
 
 def _server(gate: Gate, hub: Any, tried: Any) -> Any:
-    """A server of uvicorn's that answers for the hub, with connections of our own."""
+    """A uvicorn server that answers for the hub, with the connections of `connections`."""
     import uvicorn
 
     from hilbo.app.server.connections import Connection, Connections
@@ -109,8 +111,8 @@ def _server(gate: Gate, hub: Any, tried: Any) -> Any:
 def _open_and_close(
     server: Any, hub: Any, listener: Any, admission: "_Admission", started: Callable[[Callable[[], None]], Any]
 ) -> None:
-    """Have the hub opened before the server answers, and closed after it. Not as ASGI's lifespan, which swallows what
-    the hub raises."""
+    """Replace the server's startup and shutdown, so that the hub is opened before requests are answered and closed
+    after the last. Not as ASGI's lifespan, which swallows what the hub raises."""
     listen, hang_up = server.startup, server.shutdown
 
     async def startup(sockets=None):
@@ -140,7 +142,7 @@ def _open_and_close(
 
 
 class _Admission:
-    """Passes accepted connections to uvicorn."""
+    """Hands accepted connections to uvicorn."""
 
     def __init__(self, server: Any):
         self._protocol = functools.partial(
@@ -149,23 +151,24 @@ class _Admission:
         self._tasks: set[asyncio.Task] = set()
 
     def admit(self, line: socket.socket, role: Role | None) -> None:
-        """Serve a connection; the role is that of the key which came with it."""
+        """Start to serve a connection; the role is that of the key which came with it, or None."""
         task = asyncio.get_running_loop().create_task(self._serve(line, role))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     async def settled(self) -> None:
-        """Wait until each of them is known to uvicorn, or has ended."""
+        """Wait until each admitted connection is known to uvicorn, or has ended."""
         await asyncio.gather(*self._tasks)
 
     async def _serve(self, line: socket.socket, role: Role | None) -> None:
+        """Have uvicorn's protocol take over the connection; one that has ended is ignored."""
         with contextlib.suppress(OSError):  # it has ended meanwhile
             loop = asyncio.get_running_loop()
             await loop.connect_accepted_socket(functools.partial(self._protocol, role=role), line)
 
 
 def _files() -> int:
-    """How many files this process may have open, once it has asked for enough."""
+    """How many files this process may have open, after the limit was raised to `_FILES` as far as possible."""
     try:
         import resource
     except ImportError:  # Windows has no such limit
@@ -179,7 +182,7 @@ def _files() -> int:
 
 
 def qr_image(link: str) -> str:
-    """A link as a picture, in a data: URI."""
+    """A QR code of a link as an SVG in a data: URI."""
     import segno
 
     file = io.BytesIO()
@@ -188,7 +191,7 @@ def qr_image(link: str) -> str:
 
 
 def qr_text(link: str) -> str:
-    """A link as a picture made of characters, for a terminal."""
+    """A QR code of a link as lines of characters, for a terminal."""
     import segno
 
     file = io.StringIO()

@@ -6,14 +6,14 @@
     GET  /api/participant        the view; so /api/experimenter, and /api/experimenter/map
     GET  /api/participant/events the same as server-sent events, at every change
     POST /api/participant/…      answer, begin, break, more, here
-    POST /api/experimenter/…     pause, resume, repeat, undo, void, abort, note, estop, clear, invite
+    POST /api/experimenter/…     pause, resume, repeat, undo, void, abort, note, estop, clear, invite …
     POST /api/stimulus/hello     a program that presents begins
     GET  /preparer               the page of a person who presents; POST /api/preparer/hello and /api/preparer as below
-    POST /api/stimulus           how it is; the answer is the newest order (these two, and join, also as form and lines)
+    POST /api/stimulus           report; the response is the newest order (these two, and join, also as form and lines)
     GET  /try, /api/try, /api/try/map   the page of `hilbo try` (`tried`), what it presents, and its end
 
-Errors are {"error": sentence}: 400 not understood, 401 no key, 403 from elsewhere, 409 not now, 413 too large. The
-event loop only waits here: files, device and arithmetic have threads of their own.
+Errors are {"error": sentence}: 400 not understood, 401 no key, 403 from elsewhere, 404 none there, 409 not now, 413 too
+large, 503 not written. The event loop only waits here: files, device and arithmetic have threads of their own.
 """
 
 import asyncio
@@ -62,12 +62,14 @@ _HEADERS = {
 
 
 class _Guard:
-    """Middleware that refuses requests from other origins, and sets the security headers of all responses."""
+    """ASGI middleware that refuses requests from other hosts and origins with 403, and sets the security headers of all
+    responses."""
 
     def __init__(self, app: Any, gate: Gate):
         self.app, self.gate = app, gate
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """Handle one ASGI connection; a client that disconnects within its body gets no response."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -84,12 +86,12 @@ class _Guard:
 
 
 def application(hub: Served, gate: Gate, tried: Tried | None = None) -> Starlette:
-    """The server of one session, whose `Hub` is open; or of what stands in a hub's place. `tried`: it is `hilbo try`'s,
-    and has its page."""
+    """The ASGI application of one session, or of what stands in a hub's place. `tried`: makes the data of the page of
+    `hilbo try`, whose routes exist only with it."""
     guarded = _for(hub, gate)
     routes = [
-        Route("/", _way_in(hub)),
-        Route("/api/join", _either(_join(hub, gate)), methods=["POST"]),
+        Route("/", _join_page(hub)),
+        Route("/api/join", _json_or_lines(_join(hub, gate)), methods=["POST"]),
         Route("/api/experimenter/map", guarded("experimenter", _map)),
     ]
     routes += [Route(f"/{role}", _page(f"{role}.html")) for role in PAGES]  # without content: that needs the key
@@ -100,7 +102,7 @@ def application(hub: Served, gate: Gate, tried: Tried | None = None) -> Starlett
     routes += [Route(f"/api/experimenter/{n}", guarded("experimenter", _command), methods=["POST"]) for n in COMMANDS]
     for path, handler in (("", _report), ("/hello", _hello)):
         routes += [Route(f"/api/preparer{path}", guarded("preparer", handler), methods=["POST"])]
-        routes += [Route(f"/api/stimulus{path}", _either(guarded("stimulus", handler)), methods=["POST"])]
+        routes += [Route(f"/api/stimulus{path}", _json_or_lines(guarded("stimulus", handler)), methods=["POST"])]
     if tried is not None:
         routes += [Route("/try", _page("try.html")), Route("/api/try", guarded("stimulus", _json_of(tried.facts)))]
         routes += [Route("/api/try/map", guarded("stimulus", _json_of(tried.map)))]
@@ -109,14 +111,16 @@ def application(hub: Served, gate: Gate, tried: Tried | None = None) -> Starlett
 
 
 def _page(name: str) -> Handler:
+    """A handler that returns a file of the folder static, which needs no key."""
+
     async def page(_request: Request) -> Response:
         return Response(_FILES[name], media_type=mimetypes.guess_type(name)[0])
 
     return page
 
 
-def _way_in(hub: Served) -> Handler:
-    """The page that trades a link's token, in the study's language."""
+def _join_page(hub: Served) -> Handler:
+    """A handler that returns the page which trades a link's token for a key, with texts in the study's language."""
 
     async def way_in(_request: Request) -> Response:
         page = _FILES["join.html"].decode()
@@ -127,8 +131,9 @@ def _way_in(hub: Served) -> Handler:
     return way_in
 
 
-def _either(handler: Handler) -> Handler:
-    """The handler's response as JSON, or as lines of text where the request was a form."""
+def _json_or_lines(handler: Handler) -> Handler:
+    """A handler whose response is that of `handler` in JSON or, where the request was a form, the same content as lines
+    of text with HTTP status 200."""
 
     async def handle(request: Request) -> Response:
         answer = await handler(request)
@@ -141,18 +146,25 @@ def _either(handler: Handler) -> Handler:
 
 
 def _is_form(request: Request) -> bool:
+    """Whether the request's Content-Type is that of a form."""
     return request.headers.get("content-type", "").partition(";")[0].strip().lower() == lines.FORM
 
 
 async def _message(kind: type, request: Request) -> Any:
-    """The request's message. A JSON object is read as JSON whatever its header says: many clients declare
-    every body a form."""
+    """The request's message, of the class `kind`. A JSON object is read as JSON whatever its header says: many clients
+    declare every body a form. Whether it is a form is kept in `request.state.form`. Raises `InputError`."""
     body = await _body(request)
     request.state.form = _is_form(request) and not body.lstrip().startswith(b"{")
     return messages.read(kind, body, request.state.form)
 
 
 def _join(hub: Served, gate: Gate) -> Handler:
+    """The handler of /api/join: trade a token for its role and a new key, which ends the role's other streams.
+
+    A used token is answered only to the browser that has its key, without a new one, and to a stimulus program that
+    returns once the present one is gone. Else 400, 401, or 503 where the key cannot be stored.
+    """
+
     async def join(request: Request) -> Response:
         try:
             message = await _message(messages.Join, request)
@@ -180,7 +192,9 @@ def _join(hub: Served, gate: Gate) -> Handler:
 
 
 def _for(hub: Served, gate: Gate) -> Callable[[Role, Callable], Handler]:
-    """Makes handlers of functions of (hub, role, request), which require the role's key."""
+    """A function that makes of a role and a `handler(hub, role, request)` a handler which requires the role's key, else
+    401, and turns the errors of hub and messages into responses. A participant's request without a window counts as a
+    program's sign of life."""
 
     def guarded(role: Role, handler: Callable) -> Handler:
         async def handle(request: Request) -> Response:
@@ -206,16 +220,18 @@ def _for(hub: Served, gate: Gate) -> Callable[[Role, Callable], Handler]:
 
 
 async def _view(hub: Served, role: Role, _request: Request) -> Response:
+    """The view of the role."""
     return _json(hub.view(role))
 
 
 async def _map(hub: Served, _role: Role, _request: Request) -> Response:
+    """The slices of the map, or 404."""
     slices = await hub.map()
     return _error(404, "This session has no map.") if slices is None else _json(slices)
 
 
 def _json_of(content: Callable[[Any], Awaitable[Any]]) -> Callable:
-    """A handler whose response is computed from the hub."""
+    """A handler whose JSON response is that of the async function `content(hub)`."""
 
     async def handle(hub: Served, _role: Role, _request: Request) -> Response:
         return _json(await content(hub))
@@ -224,44 +240,52 @@ def _json_of(content: Callable[[Any], Awaitable[Any]]) -> Callable:
 
 
 async def _answer(hub: Served, role: Role, request: Request) -> Response:
+    """Log a participant's answer; the response has what `Hub.answer` returns, and the new view."""
     message = messages.read(messages.Answer, await _body(request))
     accepted = await hub.answer(message, _page_of(request))
     return _json(accepted | {"view": hub.view(role)})
 
 
 async def _press(hub: Served, role: Role, request: Request) -> Response:
+    """Carry out the participant's button that ends the path; the response has the new view."""
     message = messages.read(messages.Press, await _body(request))
     await hub.press(request.url.path.rpartition("/")[2], message, _page_of(request))
     return _json({"view": hub.view(role)})
 
 
 async def _command(hub: Served, _role: Role, request: Request) -> Response:
+    """Carry out the experimenter's command that ends the path."""
     message = messages.read(messages.Command, await _body(request))
     return _json(await hub.command(request.url.path.rpartition("/")[2], message))
 
 
 def _presenter(hub: Served, role: Role) -> StimulusRig:
-    """The rig of a stimulus program or a preparer. Raises `InputError` in sessions with another rig."""
+    """The rig of a stimulus program or a preparer. Raises `InputError` in sessions in which another rig or role
+    presents."""
     if not isinstance(hub.rig, StimulusRig) or hub.rig.role != role:
         raise InputError(others_present(hub.rig.title))
     return hub.rig
 
 
 async def _hello(hub: Served, role: Role, request: Request) -> Response:
+    """Accept a program or preparer's page that joins (`StimulusRig.hello`)."""
     message = await _message(messages.Hello, request)
     return _json(await _presenter(hub, role).hello(message, _bearer(request) or ""))
 
 
 async def _report(hub: Served, role: Role, request: Request) -> Response:
+    """Apply a report; the response is the current order, perhaps later (`StimulusRig.report`)."""
     return _json(await _presenter(hub, role).report(await _message(messages.Report, request)))
 
 
 async def _events(hub: Served, role: Role, request: Request) -> Response:
+    """The stream of the role's views, as server-sent events."""
     return StreamingResponse(_stream(hub, role, _page_of(request) or ""), media_type="text/event-stream")
 
 
 async def _stream(hub: Served, role: Role, page: str) -> AsyncIterator[bytes]:
-    """The view now and after every change; only the newest one after several changes at once."""
+    """Server-sent events: the view now and after every change, only the newest of several; a comment every `_ALIVE` s;
+    at the end the event `moved`, if another window replaced this one. The stream counts as a watcher while it lasts."""
     watcher = hub.watchers.add(role, page)
     hub.publish()
     try:
@@ -282,7 +306,7 @@ async def _stream(hub: Served, role: Role, page: str) -> AsyncIterator[bytes]:
 
 
 async def _body(request: Request) -> bytes:
-    """The body; of one that is too large only a part."""
+    """The body, read to its end; of one that is too large only the beginning, just longer than a message may be."""
     body = b""
     async for part in request.stream():
         body += part
@@ -292,13 +316,13 @@ async def _body(request: Request) -> bytes:
 
 
 def _bearer(request: Request) -> str | None:
-    """The key of a request."""
+    """The key in a request's Authorization header; None without one."""
     kind, _, key = request.headers.get("authorization", "").partition(" ")
     return key.strip() if kind.lower() == "bearer" and key.strip() else None
 
 
 def _page_of(request: Request) -> str | None:
-    """The id of the browser window that sends a request; None for a program."""
+    """The id of the browser window that sends a request, at most 64 characters; None for a program."""
     return request.headers.get("x-hilbo-page", "")[:64] or None
 
 
@@ -307,6 +331,7 @@ def _json(content: Any, status: int = 200) -> Response:
 
 
 def _not_understood(error: InputError) -> Response:
+    """An error response for a message that is refused: 413 if it is too large, else 400."""
     return _error(413 if isinstance(error, messages.TooLargeError) else 400, str(error))
 
 

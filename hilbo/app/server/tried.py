@@ -1,9 +1,9 @@
-"""`hilbo try`: what its one page is told, which presents the blocks, takes the answers and shows the map at the end.
+"""The data of the page of `hilbo try`, which presents the blocks, takes the answers and shows the map at the end.
 
 The page (static/try.js) is the stimulus and the participant of an ordinary session at once. It renders the reference
-too, so that it has to know its parameters: such answers are unblinded, and the log says so. Displacement follows force
-by the recursion of the firmware's core with full memory, solved for the position; `FIXED` are the model's parameters
-that the study does not vary. Loads no JAX before it is asked.
+too, and so has to know its parameters: such answers are unblinded, and the log says so. Displacement follows force by
+the recursion of the firmware's core with full memory, solved for the position; `FIXED` are the model's parameters that
+the study does not vary. Loads no JAX before it is needed.
 """
 
 from collections.abc import Mapping
@@ -27,20 +27,23 @@ _MIDDLE = (0.2, 0.8)  # of each range: where the reference may be, so that answe
 
 
 class Tried:
-    """The end of the page's and the model's. `study` is the session's, `reference` parameter -> physical value."""
+    """Makes the data that only the page of `hilbo try` gets. `reference`: parameter -> value in physical units, hidden
+    from the person."""
 
     def __init__(self, study: StudyFile, reference: Mapping[str, float]):
         self._study, self._reference = study, dict(reference)
 
     async def facts(self, _hub: HubInterface) -> dict[str, Any]:
-        """What the page presents by."""
+        """What the page needs to render: K0 and T, the parameters of the reference, and the coefficients of the
+        exponentials."""
         from hilbo.mechanics.exponentials import TABLE
 
         return FIXED | {"reference": self._reference, "table": TABLE[STATES]}
 
     async def map(self, hub: HubInterface) -> dict[str, Any]:
-        """The slices of one's own map through its optimum, and each parameter's range, hidden and found value, in the
-        study's unit and on [0, 1]. Without slices while they are being prepared, or before the last answer."""
+        """The slices of the person's own map, and for each parameter its range, hidden value and optimum, in the
+        study's unit and on [0, 1]; empty while the slices are being computed. Raises `InputError` before the last
+        answer."""
         if hub.state.screen not in ("done", "ended"):
             raise InputError("The map is shown after the last answer.")
         slices = await hub.map()
@@ -50,6 +53,7 @@ class Tried:
         return slices | {"parameters": [self._compared(i, best) for i in range(self._study.space.dim)]}
 
     def _compared(self, i: int, best: Mapping[str, float]) -> dict[str, Any]:
+        """Range, hidden value and optimum of parameter `i`; `best`: name -> optimum in the unit cube."""
         parameter = self._study.space.parameters[i]
         hidden, optimum = self._reference[parameter.name], best[parameter.name]
         return {
@@ -83,6 +87,7 @@ def check_study(study: StudyFile) -> None:
 
 
 def hidden_reference(study: StudyFile, seed: int) -> dict[str, float]:
-    """The reference of a seed: parameter -> physical value, anywhere in the middle of the ranges."""
+    """The hidden reference of a seed: parameter -> value in physical units, uniform in the middle 60 % of each range
+    (on its scale)."""
     unit = np.random.default_rng([seed, len(NAMES)]).uniform(*_MIDDLE, study.space.dim)
     return {p.name: float(p.to_physical(u)) for p, u in zip(study.space.parameters, unit, strict=True)}

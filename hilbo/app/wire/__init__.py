@@ -1,4 +1,4 @@
 """What goes over the connections of a session's server: messages, lines and events, and the keys that permit them.
 
-Knows no HTTP and no hub.
+Depends neither on HTTP nor on the hub.
 """

@@ -1,10 +1,10 @@
-"""The stimulus's messages for programs without a JSON parser: a form comes in, lines go out.
+"""The stimulus program's messages for clients without a JSON parser: a form as request, lines of text as response.
 
     order=5&state=presented&value.hue=211.0     a request, application/x-www-form-urlencoded
     status TAB 200, order TAB 6, do TAB neutral its answer, text/plain: a line each, fields between tabs
 
-HTTP's own status is 200 in every such answer, and the first line has the real one: libraries that post forms often keep
-the text of an answer with another status to themselves. docs/guides/stimulus.md has every line.
+HTTP's own status is 200 in every such answer, and the first line has the real one: libraries that post forms often
+withhold the text of an answer with another status. docs/guides/stimulus.md has every line.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,7 +21,8 @@ _MOST = 64  # fields of a form
 
 
 def fields_of(body: bytes) -> dict[str, Any]:
-    """The message in a form, all of its values text. Raises `InputError`."""
+    """The fields of a form as name -> text; those named "value.NAME" are together in `values`, NAME -> text. Raises
+    `InputError` for what is no form, has a field twice, or too many."""
     try:
         pairs = parse_qsl(
             body.decode(), keep_blank_values=True, strict_parsing=bool(body), errors="strict", max_num_fields=_MOST
@@ -40,11 +41,12 @@ def fields_of(body: bytes) -> dict[str, Any]:
 
 
 def lines_of(status: int, content: Mapping[str, Any]) -> str:
-    """An answer, the same as in JSON, as lines."""
+    """The content of a response, a dict as for JSON, as lines of fields between tabs; the first has the status."""
     return "".join("\t".join(map(_field, line)) + "\n" for line in (("status", status), *_lines(content)))
 
 
 def _lines(content: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
+    """The fields of each line but the first: one line for each key, and for each value and parameter."""
     for key, value in content.items():
         if key == "values":
             yield from (("value", name, number) for name, number in value.items())
@@ -55,7 +57,7 @@ def _lines(content: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
 
 
 def number_or_name(text: str) -> float | str:
-    """A value in a form: a number, or the name of a level, which never reads as one."""
+    """A value of a form: a number, or the text itself, the name of a level, if it is no number."""
     try:
         return float(text)
     except ValueError:
@@ -63,13 +65,14 @@ def number_or_name(text: str) -> float | str:
 
 
 def _parameter(p: Mapping[str, Any]) -> tuple[Any, ...]:
+    """The fields of a parameter's line; `p` as in `orders.parameters_of`."""
     if "levels" in p:
         return "levels", p["name"], *p["levels"]
     return "parameter", p["name"], p["low"], p["high"], p["tolerance"], p["unit"]
 
 
 def _field(value: Any) -> str:
-    """Numbers as their shortest decimals; a text has no tab and no line's end."""
+    """A field of a line: numbers as their shortest decimals; in a text each run of white space is one space."""
     if isinstance(value, bool):
         return "true" if value else "false"
     return " ".join(str(value).split()) if isinstance(value, str) else repr(value)

@@ -1,6 +1,6 @@
-"""What the two pages, and programs in their place, may send: JSON, every key known, every value of its type and size.
+"""The messages that pages and programs may send: JSON, every key known, every value of its type and size.
 
-docs/guides/live.md is the same for a reader. Whatever does not fit is refused with one sentence, and changes nothing.
+docs/guides/live.md describes them. A message that does not fit is refused with one sentence, and changes nothing.
 """
 
 from typing import Annotated, Any, Literal
@@ -23,15 +23,15 @@ _Milliseconds = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 
 
 class TooLargeError(InputError):
-    """A message that is longer than any that is understood."""
+    """A message of more than `LARGEST` bytes."""
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One message."""
+    """Base class of the messages."""
 
 
 class Join(_Message, frozen=True):
-    """A one-time token for the key of its role; `bearer`: a program asks, not a page."""
+    """A one-time token to be traded for the key of its role; `bearer`: a program asks, not a page."""
 
     token: _Id
     bearer: bool = False
@@ -50,14 +50,14 @@ class Answer(_Message, frozen=True):
 
 
 class Press(_Message, frozen=True):
-    """A participant's begin, break, wish for more, or sign of life; `trial` is the one that was on the page."""
+    """A participant's button (begin, break, more) or sign of life; `trial` is the one that was on the page."""
 
     trial: _Id | None = None
 
 
 class Command(_Message, frozen=True):
-    """An experimenter's command. `trial`: the one that it is about, so that it never hits another (void, undo, restore,
-    skip). `role`: whose link is wanted (invite)."""
+    """An experimenter's command. `trial`: the one that it is about, so that it never acts on another (void, undo,
+    restore, skip). `role`: whose link is wanted (invite)."""
 
     reason: _Text = ""
     text: _Text = ""
@@ -66,9 +66,9 @@ class Command(_Message, frozen=True):
 
 
 class Hello(_Message, frozen=True):
-    """What who presents says of itself: a program, or the preparer's page. `force`: it moves something that people
-    touch. `neutral_within_s`: so soon does it show nothing and push nothing when it is told, and when nobody tells it
-    anything any more. `run`: the one that it had, if it begins again."""
+    """What a program or preparer's page says when it joins. `force`: it moves something that people touch.
+    `neutral_within_s`: the time (s) in which it presents nothing and exerts no force after it was told, or was told
+    nothing any more. `run`: the one that it had, if it begins again."""
 
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
     version: Annotated[str, msgspec.Meta(max_length=100)]
@@ -78,10 +78,10 @@ class Hello(_Message, frozen=True):
 
 
 class Report(_Message, frozen=True):
-    """How a program that presents is: which order it knows, what it has done about it.
+    """The state of a program that presents: which order it knows, and what it has done about it.
 
-    `values`: what is really in force, numbers and names of levels, where the order's state is "presented" and the order
-    had any. `wait_s`: how long it would wait for another order.
+    `values`: what is really in force, numbers and names of levels, if the state is "presented" and the order had any.
+    `wait_s`: how long it would wait for another order.
     """
 
     run: _Id
@@ -95,7 +95,8 @@ class Report(_Message, frozen=True):
 
 
 def read(kind: type, body: bytes, form: bool = False) -> Any:
-    """The message in a request's body, JSON or a form (`lines`). Raises `InputError` with what is wrong with it."""
+    """The message of the class `kind` in a request's body, JSON or a form (`lines`); an empty body is an empty message.
+    Raises `TooLargeError`, and `InputError` with what is wrong."""
     if len(body) > LARGEST:
         raise TooLargeError(f"The message has more than {LARGEST} bytes, which are the most.")
     fields = fields_of(body) if form else {}
