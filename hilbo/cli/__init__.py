@@ -1,4 +1,4 @@
 """The command line: arguments, progress, exit codes, and `hilbo doctor`.
 
-May import everything; nothing imports it.
+It may import all other folders; none imports it.
 """

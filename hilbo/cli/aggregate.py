@@ -1,4 +1,5 @@
-"""`hilbo aggregate` and `hilbo robustness`: what asks for people's answers and the study that they belong to."""
+"""The commands `hilbo aggregate` and `hilbo robustness`, and what they share with others: a cohort read, a results
+folder written."""
 
 import contextlib
 import importlib
@@ -71,7 +72,10 @@ def aggregate(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Aggregate people's answers into one population map and find its optimum."""
+    """Aggregate participants' responses into one population map and find its optimum.
+
+    Writes result.json, tables, figures and report.html to the folder --out.
+    """
     if not distributed:
         begin_painter()
     start(devices)
@@ -118,7 +122,10 @@ def robustness(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Do the optima stay where they are when the evidence chooses the hyperparameters?"""
+    """Compare the optima with those of hyperparameters that maximise the evidence.
+
+    Writes result.json, tables, figures and report.html to the folder --out.
+    """
     with results(out, force) as folder, progress() as say:
         chosen, everybody, flagged = read_cohort(trials, study, material, say)
         cohort, left_out = _included(chosen, everybody)
@@ -133,8 +140,9 @@ def robustness(
 
 
 def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tuple[Any, Any, list[str]]:
-    """The study, the cohort of a trial table or of a folder of session logs, and what the device's flags left out, in
-    sentences. Raises `InputError`."""
+    """Load a study and its trial table, or a folder of session logs. Returns the study of the one `material` (None: the
+    only one in the table), its cohort, and sentences on the trials that are left out because of the device's flags.
+    Calls `start`, and prints remarks on stderr; `say` is told of progress. Raises `InputError`."""
     say("reading")
     start()
     from hilbo.study.cohort import cohort_of
@@ -159,7 +167,8 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
 
 
 def _only_material(pieces: list[Any], source: Path) -> str | None:
-    """The material that the cells of a study of several materials are of; None where they name none."""
+    """The only material named in the cells of a table; None, with a remark on stderr, if they name none. Raises
+    `InputError` if they name several."""
     named = list(dict.fromkeys(name for cells in pieces if "material" in cells for name in cells["material"]))
     if len(named) > 1:
         raise InputError(f"{source}: holds {len(named)} materials ({', '.join(named)}); choose one with --material.")
@@ -169,13 +178,15 @@ def _only_material(pieces: list[Any], source: Path) -> str | None:
 
 
 def _chosen(cohort: Any, participants: str) -> Any:
-    """Those who are named, separated by commas, in the order of the table. Raises `InputError`."""
+    """The cohort of the participants named, separated by commas, in the order of the table. Raises `InputError` for one
+    that is not in it, or named twice."""
     some = cohort.of([name.strip() for name in participants.split(",")])
     return some.of([name for name in cohort.names if name in set(some.names)])
 
 
 def _included(study, everybody) -> tuple[Any, list[str]]:
-    """The cohort without those whom the study's rule leaves out, which is said; and the sentences."""
+    """The cohort without the participants whom the study's rule of exclusion leaves out, and sentences on them, which
+    are also printed on stderr. Raises `InputError` if none is left."""
     if not study.file.exclude:
         return everybody, []
     from hilbo.study.exclusion import exclusion_sentences, included
@@ -188,8 +199,9 @@ def _included(study, everybody) -> tuple[Any, list[str]]:
 
 
 def _whole(people: int, devices: int, individuals: bool, compare: bool) -> bool:
-    """Whether optima after fewer trials, the region and the model check are computed, too. Raises `InputError` where
-    --compare asks for what is left out."""
+    """Whether all analyses are computed, that is also the optima after fewer trials, the region of the optimum and the
+    model check: with individual optima, for up to `MANY` participants on one device. Raises `InputError` if `compare`
+    is asked for without them."""
     from hilbo.study.estimate.aggregate import MANY
 
     whole = individuals and people <= MANY and devices == 1
@@ -207,14 +219,16 @@ def aggregate_cohort(
     truth: "np.ndarray | None" = None,
     selection: str = "",
 ) -> "Content":
-    """The results folder of one cohort."""
+    """Analyse a cohort, write its results to `folder`, and return the content of result.json. `truth` (d,): the true
+    optimum of a simulation; `selection`: how trials were chosen, in words, for the report."""
     return _written(_analysed(study, cohort, seed, say), folder, say, truth=truth, selection=selection)
 
 
 def _analysed(
     study: "Study", cohort: "Cohort", seed: int, say: Say, *, whole: bool = True, individuals: bool = True
 ) -> "CohortResults":
-    """What the answers say."""
+    """Fit and analyse a cohort; the first results are printed as soon as they are known, and what draws and writes is
+    imported in a thread meanwhile. `whole`: see `_whole`; `individuals`: compute individual optima too."""
     from hilbo.study.analysis.cohort_results import analyse_cohort
 
     with ThreadPoolExecutor(1) as other_core:
@@ -229,7 +243,8 @@ def _analysed(
 def _analysed_together(
     study: "Study", cohort: "Cohort", seed: int, say: Say, team: "Crew", individuals: bool
 ) -> "tuple[CohortResults, xr.Dataset]":
-    """What the answers say and the map's grid, by all devices of all processes: as arrays of this process."""
+    """Fit a cohort on all devices of all processes, without the analyses that `_whole` decides on: the results, as
+    arrays of this process, and the population map on a grid."""
     from hilbo.numerics.sharding import host_local
     from hilbo.report.results import population_grid
 
@@ -251,7 +266,9 @@ def _written(
     left_out: Sequence[str] = (),
     grid: "xr.Dataset | None" = None,
 ) -> "Content":
-    """The results folder of one cohort; with `compare` every rule beside, each person left out in turn."""
+    """Write the results folder of a cohort, and return the content of result.json. `compare`: compare all aggregation
+    methods too, leaving out one participant at a time; `left_out`: sentences on excluded participants or trials;
+    `grid`: the population map on a grid, computed here if None; `truth`, `selection`: see `aggregate_cohort`."""
     from hilbo.report.results import write_results
 
     study, beside = population.study, {}

@@ -1,4 +1,4 @@
-"""`hilbo cache`: what hilbo keeps from one command to the next, and how it is dropped."""
+"""`hilbo cache`: show or delete the compiled functions that are kept from one command to the next."""
 
 import shutil
 from typing import Annotated
@@ -15,7 +15,7 @@ def cache(
     clear: Annotated[bool, typer.Option("--clear", help="Drop everything; it is made again when needed.")] = False,
     as_json: JsonToo = False,
 ) -> None:
-    """Show the programs that are kept from one command to the next, or drop them."""
+    """Show the cache of compiled functions (folder, number, size), or clear it."""
     folder = cache_folder()
     traced, compiled = Entries(folder / "programs", remark), folder / "jax"
     if clear:
@@ -30,4 +30,5 @@ def cache(
 
 
 def _files(folder):
+    """The files of JAX's compilation cache in a folder; none if there is no such folder."""
     return [path for path in folder.glob("*-cache") if path.is_file()]

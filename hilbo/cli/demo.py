@@ -1,4 +1,4 @@
-"""`hilbo demo`: real people's answers, and a simulated study beside its truth and the paper."""
+"""`hilbo demo`: the responses of real people, and a simulated study compared with its truth and the paper."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +15,10 @@ def demo(
     seed: Annotated[int, seed_option("of the simulated people and of the points among which optima are sought")] = 0,
     force: Force = False,
 ) -> None:
-    """Real people's answers, then a whole simulated haptic study of known truth and its report."""
+    """Aggregate a real data set, then simulate a whole haptic study of known truth and report on it.
+
+    Writes both results folders to --out, and prints their optima with those of the paper.
+    """
     from importlib.resources import files
 
     data = files("hilbo") / "data"
@@ -30,7 +33,8 @@ def demo(
 
 
 def _print_demo(real: dict[str, Any], simulated: dict[str, Any], out: Path) -> None:
-    """The real optimum in a line, and the simulated misses beside the paper's; from both contents of result.json."""
+    """Print the optimum of the real data, the errors of the simulated study beside the paper's, and the paths of both
+    reports. `real`, `simulated`: contents of result.json."""
     from rich import box
     from rich.console import Console
     from rich.table import Table as RichTable

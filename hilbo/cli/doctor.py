@@ -1,4 +1,4 @@
-"""Checks before a session (`hilbo doctor`): what each one found and, where something is wrong, how to fix it.
+"""Checks before a session (`hilbo doctor`): the result of each and, where something is wrong, how to fix it.
 
 Nothing is changed: a file of a few bytes is written and removed where logs will be, and the device is queried and
 stopped, never started.
@@ -30,7 +30,8 @@ _JOINS = 120.0  # s that the program that presents has to join
 
 
 class Check(NamedTuple):
-    """A check: its name, its result as a level and in words, and how to fix it (empty where nothing is wrong)."""
+    """A check: its name, its result as a level ("good", "note" or "bad") and in words, and how to fix it (empty where
+    nothing is wrong)."""
 
     name: str
     level: Level
@@ -39,7 +40,7 @@ class Check(NamedTuple):
 
 
 def _check(name: str, words: str, fix: str | Literal[False], level: Level = "bad") -> Check:
-    """A check of this `level` where there is something to fix, else a good one."""
+    """A check of this `level` if there is something to fix, else a good one (`fix` False or empty)."""
     return Check(name, level if fix else "good", words, fix or "")
 
 
@@ -50,8 +51,9 @@ def checks(
     port: int,
     begin: Callable[[], Any] = lambda: None,
 ) -> Iterator[Check]:
-    """All checks, one after the other. `connect(damping, delay)` opens the device, logs go to `folder`, `port` is that
-    of the server.
+    """All checks, one after the other, each made when it is asked for. `connect(damping, delay)` opens the device, logs
+    go to `folder`, `port` is that of the server; without a study its checks are left out, and with [stimulus] those of
+    the device.
 
     The checks that need JAX come last, after `begin`, which starts it: the others do not wait for it.
     """
@@ -75,6 +77,7 @@ def checks(
 
 
 def _versions() -> Check:
+    """Versions of Python and packages; bad if one for live sessions is missing."""
     versions, missing = [f"Python {platform.python_version()}"], []
     for package in _PARTS:
         try:
@@ -88,6 +91,8 @@ def _versions() -> Check:
 
 
 def _disk(folder: Path) -> Check:
+    """Whether the folder of the logs, or the nearest one above it that exists, can be written, how fast, and how much
+    room there is."""
     above = (folder, *folder.resolve().parents)
     place = next((path for path in above if os.path.lexists(path)), folder)  # a session makes what is missing below
     try:
@@ -105,6 +110,7 @@ def _disk(folder: Path) -> Check:
 
 
 def _port(port: int) -> Check:
+    """Whether the server's port on this computer is free."""
     import socket
 
     with socket.socket() as probe:
@@ -118,6 +124,7 @@ def _port(port: int) -> Check:
 
 
 def _browser() -> Check:
+    """Whether a browser is installed."""
     browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
     if browser is None and sys.platform not in ("win32", "darwin"):
         return Check("browser", "note", "none is found here", "install one, or use a tablet with --lan")
@@ -125,6 +132,7 @@ def _browser() -> Check:
 
 
 def _serial_ports() -> Check:
+    """The serial ports of this computer; a note if there is none."""
     from hilbo.device.ports import list_ports
 
     try:
@@ -136,6 +144,7 @@ def _serial_ports() -> Check:
 
 
 def _study_file(path: Path) -> tuple[Check, Any]:
+    """Whether the study file is valid, and the file, or None."""
     from hilbo.study.file.reading import StudyFile
 
     try:
@@ -147,7 +156,7 @@ def _study_file(path: Path) -> tuple[Check, Any]:
 
 
 def _random_effect(file: Any) -> Iterator[Check]:
-    """A note where the study names a column that tables of sessions do not have."""
+    """A note if the study names a column for its random effect that tables of sessions do not have; else nothing."""
     name = file.random_effect
     if name not in (None, "session"):
         fix = "add it to the table that hilbo export writes, and aggregate that table"
@@ -155,6 +164,8 @@ def _random_effect(file: Any) -> Iterator[Check]:
 
 
 def _precision() -> Check:
+    """The type of numbers, and the folder and size of the cache of compiled functions; a note if it is not float64 or
+    the cache is empty."""
     import jax
     import jax.numpy as jnp
 
@@ -169,7 +180,7 @@ def _precision() -> Check:
 
 
 def _study(path: Path) -> Iterator[Check]:
-    """Checks of the feasible set and of the compiled step; one failed check if the study cannot be loaded."""
+    """Checks of the feasible set and of the time of a step; one failed check if the study cannot be loaded."""
     from hilbo.study.config import Study
 
     try:
@@ -183,7 +194,7 @@ def _study(path: Path) -> Iterator[Check]:
 
 
 def _feasible(study: Any) -> Check:
-    """The share of the search space that is passive and within the constraints."""
+    """The share of the search space that is passive and within the constraints; bad if less than 2 % is passive."""
     from hilbo.search.rendering import delay_words
     from hilbo.search.space import share_of_cube
 
@@ -199,7 +210,8 @@ def _feasible(study: Any) -> Check:
 
 
 def _step(study: Any) -> Check:
-    """Time from an answer to the next point, compiled before but not chosen in advance."""
+    """Time from an answer to the next point, compiled before but not chosen in advance; a note if it is above
+    `_SLOW`."""
     steps = min(study.file.selection.space_filling + 1, study.file.selection.trials - 1)
     if not steps:
         return Check("time of a step", "good", "none to measure: a session has one trial")
@@ -216,6 +228,8 @@ def _step(study: Any) -> Check:
 
 
 def _device(connect: Callable[[float | None, float | None], Any], file: Any) -> Iterator[Check]:
+    """Checks of the device: connection, loopback and, for the study `file`, damping and delay. One failed check if it
+    cannot be connected."""
     from hilbo.device.failures import DeviceError
 
     mechanics = file.space.mechanics if file is not None else None
@@ -234,7 +248,7 @@ def _device(connect: Callable[[float | None, float | None], Any], file: Any) -> 
 
 
 def _language(file: Any) -> Iterator[Check]:
-    """Whether all texts are translated, and reviewed by a native speaker."""
+    """A note if some texts are not translated, or not reviewed by a native speaker; nothing for English."""
     from hilbo.study.file.languages import LANGUAGES, language
 
     session = file.session
@@ -251,7 +265,8 @@ def _language(file: Any) -> Iterator[Check]:
 
 
 def _stimulus(file: Any) -> Iterator[Check]:
-    """Completeness of a study whose stimuli are presented by a program or a person."""
+    """Notes on what a study with [stimulus] leaves out: that table, the participants' texts, the number of the ethics
+    protocol."""
     table, parameters = file.stimulus, file.space.parameters
     off = ", ".join(f"{p.name} {table.tolerance_words(p)}" for p in parameters if not p.levels)
     words = f"a {table.by} presents, and confirms within {table.within:g} s"
@@ -267,8 +282,9 @@ def _stimulus(file: Any) -> Iterator[Check]:
 
 
 def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator[Check]:
-    """Have the stimulus program join (by a link on stderr), present and stop. Raises `InputError` for a study without
-    one."""
+    """Have the stimulus program join (by a link printed on stderr, within `patience` s), present and stop, and yield
+    how long that took, or one failed check. Raises `InputError` for a study without a program, and if the port is in
+    use."""
     from hilbo.app.rigs.stimulus_check import StimulusCheck
     from hilbo.app.server import serve
     from hilbo.study.file.reading import StudyFile
@@ -298,6 +314,7 @@ def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator
 
 
 def _loopback(device: Any) -> Check:
+    """200 messages to the device and back; bad if any came back changed."""
     count, wrong = 200, 0
     begun = time.perf_counter()
     for i in range(count):
@@ -309,13 +326,14 @@ def _loopback(device: Any) -> Check:
 
 
 def _damping(has: float, needs: float) -> Check:
+    """Whether the device's damping (N·s/m) is at least that of the study."""
     words = f"the study counts on {needs:g} N·s/m, the device says {has:g}"
     fix = "measure it (`hilbo device measure-damping`), then lower the study's"
     return _check("damping", words, has < needs * (1 - 1e-6) and fix)
 
 
 def _delay(has: float, counted: float) -> Check:
-    """Whether the study's search space takes the delay into account for which the device checks sets."""
+    """Whether the study assumes at least the delay (s) for which the device checks its sets."""
     words = f"the study assumes a delay of at most {1e3 * counted:g} ms; the device checks its sets for"
     fix = f"write [renderer] delay = {has:g} and plan the study again"
     return _check("delay", f"{words} {1e3 * has:g} ms", has > counted + 1e-9 and fix)

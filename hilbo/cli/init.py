@@ -39,7 +39,7 @@ def init(
     by: Annotated[str, typer.Option(help="Without --device: a program presents, or a person by hand.")] = "program",
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
-    """Write a commented study file, from a few words about the study."""
+    """Write a commented study file with the name, parameters and answers given."""
     check_free(study, force)
     from hilbo.study.template import NewStudy, parameter_of, study_text
 

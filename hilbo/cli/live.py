@@ -26,14 +26,15 @@ _EXTRA = "Live sessions need starlette, uvicorn and segno; install them with: pi
 
 
 class Device(NamedTuple):
-    """Which device."""
+    """Options: which device, at which rate, and how it is simulated."""
 
     device: Where = "sim"
     baud: Baud = 921_600
     sim: Sim = None
 
     def open(self, damping: float | None, delay: float | None) -> Any:
-        """A connected `Renderer` of a device that has at least this damping (N·s/m) and at most this delay (s)."""
+        """A connected `Renderer` of a device that has at least this damping (N·s/m) and at most this delay (s). Raises
+        `InputError` or `DeviceError`."""
         from hilbo.hardware_bridge import Renderer
 
         options = sim_options(self.sim)
@@ -43,7 +44,7 @@ class Device(NamedTuple):
 
 
 class Served(NamedTuple):
-    """Where a session is served, and where its log goes."""
+    """Options: where a session is served, and where its log goes."""
 
     logs: Annotated[Path, typer.Option("--logs", help="Folder of the session logs.")] = Path("logs")
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the server; 0 takes any.")] = _PORT
@@ -78,12 +79,15 @@ def session(
     ] = None,
     as_json: JsonToo = False,
 ) -> None:
-    """A live session: the participant's and the experimenter's page, what shows renderings, and the log."""
+    """Run a live session: participant's and experimenter's page, device or stimulus program, and the log.
+
+    Prints one-time links on stderr, and serves until Ctrl-C.
+    """
     need_extra()
     from hilbo.app.server import serve
 
     with contextlib.ExitStack() as held:
-        _claim(served.logs, participant, name)
+        _make_logs_folder(served.logs, participant, name)
         place = serve.bound(served.port, lan=served.lan)
         held.callback(place.socket.close)
         with progress() as say:
@@ -105,6 +109,7 @@ def session(
 
 
 def _serve(hub, place, served, as_json) -> None:
+    """Serve an open session until it ends; new links come with a QR code."""
     from hilbo.app.server import serve
 
     def invite(role):
@@ -116,7 +121,8 @@ def _serve(hub, place, served, as_json) -> None:
 
 
 def _started(hub, place, served, as_json) -> None:
-    """Links on the terminal; with --json in one line on stdout, for programs."""
+    """Print notes, log and links on stderr, with --json also in one line on stdout; open the experimenter's page with
+    --open."""
     from hilbo.app.pages.pace import duration
     from hilbo.app.server import serve
 
@@ -146,8 +152,9 @@ def _started(hub, place, served, as_json) -> None:
         webbrowser.open(links["experimenter"])
 
 
-def _claim(logs: Path, participant: str, name: str | None) -> None:
-    """The folder of the logs, made; words that no session can be called by are refused before."""
+def _make_logs_folder(logs: Path, participant: str, name: str | None) -> None:
+    """Make the folder of the logs. Raises `InputError` if that fails, or before it for a participant or session label
+    that is not allowed."""
     from hilbo.session.log.header_check import check_label
     from hilbo.study.formats.cell_text import check_id, check_text
 
@@ -162,7 +169,7 @@ def _claim(logs: Path, participant: str, name: str | None) -> None:
 
 
 def need_extra() -> None:
-    """Refuse to serve where the packages for it are missing. Raises `InputError`."""
+    """Raise `InputError` if packages that serve a session are missing."""
     import importlib.util
 
     if any(importlib.util.find_spec(package) is None for package in ("starlette", "uvicorn", "segno")):
@@ -180,7 +187,10 @@ def doctor(
     ] = False,
     as_json: JsonToo = False,
 ) -> None:
-    """Is everything ready for a session? What is not, and how to fix it."""
+    """Check that everything is ready for a session, and print how to fix what is not.
+
+    Exit code 1 if something is bad.
+    """
     from hilbo.cli.doctor import checks, stimulus_checks
 
     if stimulus and study is None:
@@ -205,7 +215,8 @@ def doctor(
 def live(
     study: Path, out: Path, preset: str | None, phase: str, seconds: float | None, seed: int, say: Any
 ) -> dict[str, Any]:
-    """A whole session without people, into a new folder: `hilbo simulate --live`."""
+    """Run a whole session without people into a new folder, for `hilbo simulate --live`, and return its summary
+    (`rehearse`). Raises `InputError` if the folder is not empty, or packages or a browser are missing."""
     need_extra()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: exists already; choose another --out.")

@@ -1,8 +1,8 @@
-"""The command line: all commands, and how a run of one ends.
+"""The command line: all commands, and how each run ends.
 
-Each command is a function of a neighbour; the modules of this folder are the only places that parse arguments. Results
-go to a folder, machine-readable ones with `--json` to stdout, progress to stderr (`console`). Exit code 0: done, 1:
-failed, 2: bad usage or bad input, said in one sentence.
+The commands are functions of the other modules of this folder, the only places that parse arguments. Results go to a
+folder, machine-readable ones with `--json` to stdout, progress to stderr (`console`). Exit code 0: done, 1: failed, 2:
+bad usage or bad input, in one sentence.
 """
 
 import warnings
@@ -35,6 +35,7 @@ app = typer.Typer(
 
 
 def _say_version(wanted: bool) -> bool:
+    """Print hilbo's version and exit if the option is given; else return False."""
     if wanted:
         import hilbo
 
@@ -49,11 +50,13 @@ def _all(
         bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Print hilbo's version.")
     ] = False,
 ) -> None:
-    """From people's ordinal answers to a population optimum, for haptic rendering of viscoelastic material."""
+    """Estimate the population optimum from participants' ordinal responses, for haptic rendering of viscoelastic
+    material."""
 
 
 def main() -> None:
-    """Entry point: runs a command, and turns bad input into one sentence and exit code 2."""
+    """Entry point: run the command of the arguments. Ends the process after an error, with one sentence on stderr: code
+    2 for bad input, 1 for any other failure; remarks on the input are printed as sentences too."""
     warnings.showwarning = say_remarks(warnings.showwarning)
     try:
         app()

@@ -1,4 +1,4 @@
-"""The commands about materials: `hilbo identify` and `hilbo passivity`; `cli` adds them to its own."""
+"""The commands on materials, `hilbo identify` and `hilbo passivity`."""
 
 import sys
 from pathlib import Path
@@ -41,7 +41,10 @@ def identify(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Find the parameters of a material from creep and relaxation tests."""
+    """Find the parameters of a material from creep and relaxation tests, or from moduli.
+
+    Writes result.json, figures and report.html to the folder --out.
+    """
     check_choice("memory", memory, ("short", "full"))
     check_choice("begin", begin, ("rest", "equilibrium"))
     check_choice("model", model, ("fosls", "fractional-maxwell"))
@@ -74,6 +77,8 @@ def identify(
 
 
 def _model(measured, model, weights, taps, period, memory, instrument) -> Any:
+    """The model to fit: a sampled FO-SLS for tests with a force (`measured`), else one of moduli. `instrument`: lag
+    (ms) and corner (Hz) as given. Raises `InputError` for options of the other kind."""
     from hilbo.identification.moduli import Continuous, FractionalMaxwell
     from hilbo.identification.sampled import Sampled
 
@@ -108,7 +113,10 @@ def passivity(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Is a parameter set passive on a device, by how much, and what is the largest K1?"""
+    """Check whether a parameter set is passive on a device, by how much, and what the largest K1 is.
+
+    Prints the result; with --out also writes figures and report.html.
+    """
     if K1 is None or B1 is None or alpha is None:
         name = "K1" if K1 is None else "B1" if B1 is None else "alpha"
         raise InputError(f"--{name} is missing; a set has --K1, --B1 and --alpha.")
@@ -139,7 +147,8 @@ def passivity(
 
 
 def _rendered(K0: float | None, K1: float, B1: float, alpha: float, renderer: dict[str, Any]) -> Any:
-    """The FO-SLS as a renderer samples it; K0 from the effective stiffness where it is not given."""
+    """The FO-SLS as a renderer samples it; K0 (N/mm) from the effective stiffness where it is None. Raises `InputError`
+    for an order outside (0, 1] then."""
     import numpy as np
 
     from hilbo.viscoelastic import FOSLS
@@ -155,7 +164,8 @@ def _rendered(K0: float | None, K1: float, B1: float, alpha: float, renderer: di
 
 
 def _renderer(study):
-    """[renderer] of a study, or the paper's."""
+    """N, T, memory, K_eff, damping and delay of the [renderer] of a study file, or those of the paper for None. Raises
+    `InputError` for a study without one."""
     if study is None:
         return {"N": 101, "T": 1e-3, "memory": "short", "K_eff": 0.44, "damping": 0.95, "delay": 0.0}
     from hilbo.study.file.reading import StudyFile
@@ -167,12 +177,13 @@ def _renderer(study):
 
 
 def _order(alpha):
+    """Raise `InputError` unless the order alpha is above 0 and at most 1."""
     if not 0 < alpha <= 1:
         raise InputError(f"alpha is {alpha}; it must be above 0 and at most 1: the order of the fractional element.")
 
 
 def _number(name: str, text: str, words: tuple[str, ...]) -> float | str:
-    """One of the words, or a number."""
+    """The text itself if it is one of the words, else as a number. Raises `InputError` if it is neither."""
     if text in words:
         return text
     try:
@@ -183,5 +194,6 @@ def _number(name: str, text: str, words: tuple[str, ...]) -> float | str:
 
 
 def _positive(name, value):
+    """Raise `InputError` unless the option's value is None, or positive and finite."""
     if value is not None and not 0 < value < float("inf"):
         raise InputError(f"--{name} is {value}; it must be a number above 0.")

@@ -1,6 +1,6 @@
-"""Commands around live sessions: `hilbo plan`, `hilbo export`, `hilbo participants`.
+"""The commands around live sessions: `hilbo plan`, `hilbo export`, `hilbo participants`.
 
-What they write is whole or absent, and nothing is replaced without `--force`.
+Their files are written whole or not at all, and nothing is replaced without `--force`.
 """
 
 import shutil
@@ -88,8 +88,8 @@ def export(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Tables of a folder of session logs, as hilbo report reads them: trials, validation and sets (Psych-DS), the study
-    file, and netCDF for xarray and ArviZ."""
+    """Write the tables of a folder of session logs, as hilbo report reads them: trials, validation and sets (Psych-DS),
+    the study file, and netCDF for xarray and ArviZ."""
     from hilbo.session.export import tables as log_tables
     from hilbo.session.export.netcdf import netcdf
     from hilbo.session.export.psych_ds import psych_ds
@@ -124,7 +124,7 @@ def add(
     age: Annotated[str, typer.Option(help="Years.")] = "",
     handedness: Annotated[str, typer.Option(help="right, left or both.")] = "",
 ) -> None:
-    """Add somebody to the list of participants."""
+    """Add a participant and their consent to the list of participants, which is made if there is none."""
     from hilbo.session.plan.participants import add_person
 
     row = {"participant": participant, "consent_time": consent_time, "protocol_number": protocol_number}
@@ -137,7 +137,8 @@ def delete(
     participant: Annotated[str, typer.Argument(help="Pseudonymous id.")],
     yes: Annotated[bool, typer.Option("--yes", help="Do it; without, nothing is touched.")] = False,
 ) -> None:
-    """Remove one participant who withdraws from everything below a folder, and say all that was done and left."""
+    """Delete all data of a participant who withdraws, below a folder, and list what was deleted and what needs manual
+    action."""
     from hilbo.session.withdrawal.withdrawal import Withdrawal, delete_participant
 
     if not yes:
@@ -150,6 +151,7 @@ def delete(
 
 
 def _say_done(done) -> None:
+    """Print on stderr what a withdrawal has removed, renamed and left, and the commands that make results again."""
     for path, count in done.removed.items():
         typer.echo(f"{path}: {count} removed", err=True)
     for path, count in done.renamed.items():
@@ -161,12 +163,13 @@ def _say_done(done) -> None:
 
 
 def _plan_of(path, kind, source, people, materials, paths, trials, session, seed) -> Any:
-    """The plan; `paths`: material -> result.json, of which the sets of a validation are made."""
+    """A new plan; `paths`: material -> result.json, from which the sets of a validation are made. Prints what a
+    device's delay leaves of the search space. Raises `InputError`."""
     start()
     from hilbo.session.plan.plan import make_plan
 
     with progress() as say:
-        study = None if kind == "optimisation" else _whole(path)
+        study = None if kind == "optimisation" else _load_study(path)
         file = _searchable(path) if study is None else study.file
         _say_delays(file, materials)
         return make_plan(
@@ -182,6 +185,8 @@ def _plan_of(path, kind, source, people, materials, paths, trials, session, seed
 
 
 def _people(count, names, letter) -> list[str]:
+    """The ids of the participants: the `names`, separated by commas, or `count` numbers after a letter (P01, P02).
+    Raises `InputError` unless exactly one of both is given."""
     if (count is None) == (names is None):
         raise InputError("plan: give either --participants (how many) or --names.")
     if names is not None:
@@ -191,7 +196,8 @@ def _people(count, names, letter) -> list[str]:
 
 
 def _searchable(path) -> Any:
-    """The study's file, of whose parameters something can be rendered. Whoever plans an optimisation needs no model."""
+    """The study file, checked to have parameters that a device can render passively; no model is needed to plan an
+    optimisation. Raises `InputError`."""
     from hilbo.search.space import SearchSpace
     from hilbo.study.file.reading import StudyFile, read_study
 
@@ -203,7 +209,8 @@ def _searchable(path) -> Any:
 
 
 def _say_delays(study, materials) -> None:
-    """What the delay of the device leaves of the search space, of each material's where there are several."""
+    """Print on stderr what the delay of the device leaves of the search space, for each material; nothing without a
+    delay."""
     from hilbo.search.rendering import delay_words
     from hilbo.search.space import SearchSpace
 
@@ -213,14 +220,17 @@ def _say_delays(study, materials) -> None:
             remark((f"{name}: " if name else "") + delay_words(SearchSpace(box.parameters, box.mechanics)))
 
 
-def _whole(path) -> Any:
+def _load_study(path) -> Any:
+    """The study of a file, with its model. Raises `InputError`."""
     from hilbo.study.config import Study
 
     return Study.load(path)
 
 
 def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
-    """Material ("" without) -> the sets to compare."""
+    """Material ("" without) -> name -> parameters of the sets that validations compare, from the results in `paths`
+    (material -> result.json). Raises `InputError` if they do not fit the study or the participants, or --trials is
+    missing."""
     from hilbo.session.export.tables import read_log_trials
     from hilbo.session.plan import validation_sets
     from hilbo.study.cohort import cohort_of, read_trials
@@ -246,6 +256,8 @@ def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
 
 
 def _by_material(materials, given) -> dict[str, Path]:
+    """Material ("" without) -> path, from the texts of --from: one path, or MATERIAL=PATH for each material. Raises
+    `InputError` for any other choice."""
     if not given:
         raise InputError("plan: give --from result.json, of which the sets are made.")
     if len(given) == 1 and len(materials) <= 1 and "=" not in given[0]:
@@ -258,6 +270,8 @@ def _by_material(materials, given) -> dict[str, Path]:
 
 
 def _reissued(path, study_path, study, text, results_):
+    """The plan of a file with the row of one participant given to another, by the text OLD=NEW; nothing is written.
+    Raises `InputError`."""
     from hilbo.session.plan.plan import check_plan, reissue
     from hilbo.study.file.plan_file import read_plan
 
@@ -276,8 +290,8 @@ def _reissued(path, study_path, study, text, results_):
 
 
 def _check_not_in_map(path, study_path, materials, results_, new):
-    """Raise InputError if the participant `new` is one of the people of the aggregate that the plan validates. Only the
-    result files (`results_`) name them."""
+    """Raise `InputError` if the participant `new` contributed to the aggregate that the plan validates, or if no result
+    files (`results_`) are given: only these name them."""
     if not results_:
         raise InputError(
             f"{path}: validates an aggregate, by people who are not in it; add --from result.json, of which its sets"
@@ -287,13 +301,15 @@ def _check_not_in_map(path, study_path, materials, results_, new):
     from hilbo.session.plan.validation_sets import check_participants
     from hilbo.study.results.result_json import read_result
 
-    study = _whole(study_path)
+    study = _load_study(study_path)
     for material, source in _by_material(materials, results_).items():
         result = read_result(source, study.material(material) if material else study)
         check_participants(result, [new], "aggregate")
 
 
 def _check_register(register, out, reissue, force):
+    """Raise `InputError` if --register is given with --reissue, names the file of the plan, or a file that may not be
+    written."""
     if reissue is not None:
         raise InputError("--register belongs to a new plan, and --reissue changes one; the page of the old plan stays.")
     if register.resolve() == out.resolve():
@@ -302,6 +318,7 @@ def _check_register(register, out, reissue, force):
 
 
 def _write_registration(file, plan, out, force):
+    """Write the page for a pre-registration, and print a remark on it on stderr."""
     from hilbo import __version__
     from hilbo.report.registration import registration
 
@@ -310,6 +327,8 @@ def _write_registration(file, plan, out, force):
 
 
 def _write_plan(plan, out, force, as_json):
+    """Write a plan to a file, and print on stderr whether its orders are balanced; with `as_json` the plan on
+    stdout."""
     from hilbo.study.file.plan_file import plan_text
 
     text = plan_text(plan)

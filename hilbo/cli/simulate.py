@@ -36,7 +36,10 @@ def simulate(
     ] = None,
     seconds: Annotated[float | None, typer.Option(min=0.05, help="With --live: duration of every step.")] = None,
 ) -> None:
-    """Simulate a study whose truth is known, and aggregate it; or hold one session without people."""
+    """Simulate a study of known truth and aggregate it; with --live, run one session with a simulated participant.
+
+    Writes the simulated trials and their results, or the session's log and screenshots, to the folder --out.
+    """
     _check_mode(live, {"--participants": participants, "--force": force}, {"--kind": kind, "--seconds": seconds})
     if live:
         _simulate_live(preset, study, out, kind or "optimisation", seconds, seed, as_json)
@@ -47,7 +50,8 @@ def simulate(
 
 
 def _check_mode(live: bool, of_a_study: Mapping[str, Any], of_a_session: Mapping[str, Any]) -> None:
-    """Refuse options that would be ignored. Raises `InputError`."""
+    """Raise `InputError` for an option that would be ignored: with `live` one of a study, without it one of a session.
+    Both map names of options to values; one without a value was not given."""
     if live and (given := [name for name, value in of_a_study.items() if value]):
         raise InputError(
             f"{given[0]} does nothing with --live, which holds one person's session in a new folder; leave it out."
@@ -57,6 +61,8 @@ def _check_mode(live: bool, of_a_study: Mapping[str, Any], of_a_session: Mapping
 
 
 def _simulate(preset, source, count, seed, folder, say) -> dict[str, Any]:
+    """Simulate `count` participants of the study file `source` (None: the paper's), write their trials and results to
+    `folder`, and return the content of result.json; the error of the optimum is printed."""
     say("simulating")
     start()
     from hilbo.report.registration import selection_words
@@ -73,6 +79,7 @@ def _simulate(preset, source, count, seed, folder, say) -> dict[str, Any]:
 
 
 def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:
+    """Run one session without people into the folder `out`, and print its summary on stdout."""
     from importlib.resources import files
 
     source = Path(str(files("hilbo") / "data" / "paper.toml")) if study is None else study

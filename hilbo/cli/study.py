@@ -25,7 +25,10 @@ def validate(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """What the validation sessions say: confusion matrix, preferences, and the paper's tables II to IV."""
+    """Analyse validation sessions: confusion matrix, preferences, and the paper's tables II to IV.
+
+    Writes result.json, tables, figures and report.html to the folder --out.
+    """
     with results(out, force) as folder, progress() as say:
         start()
         from hilbo.report.validation import write_validation
@@ -51,7 +54,10 @@ def power(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """How many participants and trials are enough for a given error of the optimum: from simulated studies."""
+    """Find how many participants and trials are enough for a given error of the optimum, by simulated studies.
+
+    Writes result.json, a table, figures and report.html to the folder --out.
+    """
     begun = time.perf_counter()
     with results(out, force) as folder, progress() as say:
         start()
@@ -76,6 +82,7 @@ def power(
 
 
 def _numbers(text: str, option: str) -> tuple[int, ...]:
+    """Whole numbers from a text in which commas separate them, sorted. Raises `InputError`, which names the option."""
     try:
         return tuple(sorted(int(number) for number in text.split(",")))
     except ValueError:
@@ -95,7 +102,10 @@ def report(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """The whole results section from a folder of sessions: one page, figures and tables, in the paper's order."""
+    """Write the whole results section of a folder of sessions: one page, figures and tables, in the paper's order.
+
+    They go to the folder --out.
+    """
     if out.resolve() in (folder.resolve(), *folder.resolve().parents):
         raise InputError(f"{out}: holds the folder that is read; choose another --out.")
     with results(out, force) as destination, progress() as say:
@@ -109,8 +119,8 @@ def report(
 
 
 def simulated_report(folder: Path, seed: int, say: Callable[..., None], count: int = 24) -> dict[str, Any]:
-    """A simulated study of the paper's kind with its validation sessions, as a folder that `hilbo report` reads, and
-    its report in the same folder; returns the content of result.json."""
+    """Simulate a study of the paper's kind, with its validation sessions, into `folder`, as `hilbo report` reads it,
+    write its report there too, and return the content of result.json. `count`: number of participants."""
     import numpy as np
 
     from hilbo.report.study.report import write_study

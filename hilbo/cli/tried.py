@@ -36,7 +36,10 @@ def tried(
     out: Annotated[Path | None, typer.Option("--out", help="Folder for study and log; by default a new one.")] = None,
     browse: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in this computer's browser.")] = True,
 ) -> None:
-    """Take part yourself: compare soft blocks under the mouse, and see your own map. No device is needed."""
+    """Take part yourself: compare soft blocks under the mouse, and see your own map. No device is needed.
+
+    Serves the page until Ctrl-C.
+    """
     need_extra()
     from hilbo.app.server import serve
 
@@ -58,7 +61,8 @@ def tried(
 
 
 def _opened(folder, seed, say):
-    """The hub of a session whose reference is hidden, its log, and what its page is told."""
+    """The hub of a session with a hidden reference that depends on the seed, its open log in the folder, and the data
+    of its page (`Tried`). The folder has study.toml."""
     from hilbo.app.hub.opening import Wanted, opened
     from hilbo.app.server.tried import Tried, hidden_reference
     from hilbo.study.file.reading import StudyFile
@@ -72,7 +76,8 @@ def _opened(folder, seed, say):
 
 
 def study_text(source: Path | None, trials: int | None) -> str:
-    """The study file of a session: hilbo's own with so many trials, or a given one as it is. Raises `InputError`."""
+    """The text of the session's study file: hilbo's own with so many `trials`, or that of the file `source`. Raises
+    `InputError` for a file that `hilbo try` cannot present, or with `trials` given too."""
     from importlib.resources import files
 
     if source is None:
@@ -89,7 +94,8 @@ def study_text(source: Path | None, trials: int | None) -> str:
 
 @contextlib.contextmanager
 def _folder(out):
-    """A folder for study and log: a new one stays if there is an answer in it."""
+    """The folder for study and log: `out`, made if it is missing, or a new temporary one, which is deleted at the end
+    unless a log in it has an answer. Raises `InputError` if `out` is not empty."""
     if out is not None:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise InputError(f"{out}: exists already; choose another --out.")
@@ -105,6 +111,7 @@ def _folder(out):
 
 
 def _need_browser() -> None:
+    """Raise `InputError` if this computer has no browser."""
     import webbrowser
 
     try:
@@ -116,7 +123,8 @@ def _need_browser() -> None:
 
 
 def _started(place, log: Path, browse: bool) -> None:
-    """The page's link, with the tokens of the two roles that it has."""
+    """Print the page's link, with the tokens of its two roles, and the log's path on stderr; open the page if
+    `browse`."""
     links = place.links(("participant", "stimulus"))
     address, _, token = links["participant"].partition("/#")
     link = f"{address}/try#{token}.{links['stimulus'].partition('/#')[2]}"

@@ -1,7 +1,7 @@
-"""`hilbo device`: a rendering device on a line, or a simulated one, from the command line.
+"""The commands of `hilbo device`: a rendering device on a line, or a simulated one.
 
 Results on stdout (`--json` for machines), progress and warnings on stderr. Exit code 0: done, 1: the device or the line
-failed, 2: bad usage or bad input, numbers that the device refuses included. The device is stopped at the end of every
+failed, 2: bad usage or bad input, including numbers that the device refuses. The device is stopped at the end of every
 command.
 """
 
@@ -38,7 +38,7 @@ Seconds = Annotated[float | None, typer.Option(help="End after so many seconds o
 
 @app.command()
 def ports(as_json: JsonToo = False) -> None:
-    """The serial ports of this computer."""
+    """List the serial ports of this computer."""
     from hilbo.device.ports import list_ports
 
     serial_ports = list_ports()
@@ -49,7 +49,7 @@ def ports(as_json: JsonToo = False) -> None:
 @app.command()
 @takes(line=Line)
 def hello(line: Line, as_json: JsonToo = False) -> None:
-    """Who is there: version, limits, damping, stroke, and what it can do."""
+    """Identify the device: version, limits, damping, stroke, capabilities, and the set in force."""
     from dataclasses import asdict
 
     from hilbo.device.reasons import Capability
@@ -104,7 +104,7 @@ def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: JsonToo 
 @app.command()
 @takes(line=Line)
 def stop(line: Line, as_json: JsonToo = False) -> None:
-    """Force to zero, smoothly, whoever started it."""
+    """Force to zero, smoothly, even if another program started it."""
     _at_once(line, "Stop", as_json)
 
 
@@ -128,7 +128,7 @@ def clear(line: Line, as_json: JsonToo = False) -> None:
 @app.command()
 @takes(line=Line)
 def monitor(line: Line, seconds: Seconds = None, as_json: JsonToo = False) -> None:
-    """State, force and position as they go by. Nothing is started."""
+    """Show state, force and position as they change. Nothing is started."""
     from hilbo.cli.device.screen import watch
 
     with opened(line) as device:
@@ -147,7 +147,7 @@ def record(
     force: ForceFile = False,
     as_json: JsonToo = False,
 ) -> None:
-    """Telemetry to a CSV file: tick, time_s, position_mm, force_N, sensed_N, flags. Ctrl-C ends it earlier."""
+    """Write telemetry to a CSV file: tick, time_s, position_mm, force_N, sensed_N, flags. Ctrl-C ends it earlier."""
     from hilbo.device.failures import DeviceError
 
     check_free(out, force)
@@ -168,7 +168,8 @@ def record(
 
 
 def _recorded(device: Any, seconds: float, path: Path) -> tuple[int, Exception | None]:
-    """Write samples as they arrive: their number, and the error of the device or the line that ended it."""
+    """Write samples to a CSV file as they arrive, for `seconds` of the device's time or until Ctrl-C: their number, and
+    the `DeviceError` that ended it, or None."""
     from hilbo.device.failures import DeviceError
 
     samples, begun, ticks = 0, None, seconds / device.tick_s
@@ -191,7 +192,7 @@ def decode(
     capture: Annotated[Path, typer.Argument(help="Bytes of a line, as --capture writes them.", show_default=False)],
     as_json: JsonToo = False,
 ) -> None:
-    """Captured bytes made readable: every frame, and what is wrong with the others."""
+    """Print every frame of a file of captured bytes, and what is wrong with damaged ones."""
     from dataclasses import asdict
 
     from hilbo.device.frames import WireError
@@ -233,7 +234,7 @@ def feel(
 @app.command()
 @takes(line=Line)
 def simulate(line: Line) -> None:
-    """A simulated device that stays, for other programs: prints its port, ends with Ctrl-C."""
+    """Run a simulated device for other programs: prints its port, ends with Ctrl-C."""
     from hilbo.cli.device.options import simulator
 
     device = simulator(line)
@@ -248,7 +249,8 @@ def simulate(line: Line) -> None:
 
 
 def _begin(device: Any, wanted: dict[str, Any] | None) -> None:
-    """Put the set in force, if one is given, and start; a handle in the material has `_LEAVES` s to leave."""
+    """Put a set in force, if one is given, and start to render; a handle in the material has `_LEAVES` s to leave.
+    Prints both on stderr. Raises `DeviceError`."""
     if wanted is not None:
         print(f"in force: {set_words(device.send(**wanted))}", file=sys.stderr)
     if device.status().contact:
@@ -257,7 +259,8 @@ def _begin(device: Any, wanted: dict[str, Any] | None) -> None:
 
 
 def _at_once(line: Line, name: str, as_json: bool) -> None:
-    """Send a request that a device obeys before HELLO, with nothing before it."""
+    """Send "Stop" or "Estop" as the first message of a connection, which a device obeys even before HELLO, and print
+    that it is done. A simulated device is connected as usual."""
     from hilbo.device import messages
     from hilbo.device.link import Link
     from hilbo.device.ports import open_port

@@ -81,22 +81,26 @@ def commission(
 
 
 class _Terminal:
-    """A person at the terminal."""
+    """A person at the terminal, who is asked on stderr and answers on stdin."""
 
     def __init__(self, encoder_checked: bool):
         self._encoder_checked = encoder_checked
 
     def encoder_checked(self) -> bool:
+        """Whether the encoder's sign was checked before; if not, the person is asked to push the handle in now, which
+        the caller measures."""
         if not self._encoder_checked:
             _ask("The motor is at rest. Now push the handle in by hand, towards the material, by a few mm.")
         return self._encoder_checked
 
     def take_hands_off(self) -> None:
+        """Ask the person to take their hands off and type the phrase. Raises `InputError` for any other text."""
         _ask(f'The device will move by itself. Take your hands off, then type "{PHRASE}":')
         _check_phrase(sys.stdin.readline().strip(), "The answer")
 
     def place(self, moved_mm: float) -> float:
-        """Ask the person to hold the handle at the surface: position 0 mm. `moved_mm` is not needed for that."""
+        """Ask the person to hold the handle at the surface, and return its position, 0 mm. Raises `InputError` at the
+        end of the input. `moved_mm` is not needed for that."""
         _ask("The motor is at rest. Place the handle at the surface, hold it there, and press Enter.")
         if not sys.stdin.readline():
             raise InputError("The handle was not placed at the surface (end of input); commission the device again.")
@@ -104,23 +108,28 @@ class _Terminal:
 
 
 class _Script:
-    """A script that answers for a person; `position` is where the handle stood at the start, mm."""
+    """A script that answers for a person; `position` is where the handle was at the start, mm, or None."""
 
     def __init__(self, position: float | None):
         self.position = position
 
     def encoder_checked(self) -> bool:
+        """True: a script must state that the encoder was checked."""
         return True
 
     def take_hands_off(self) -> None:
+        """Do nothing: the phrase was given as an option."""
         return
 
     def place(self, moved_mm: float) -> float | None:
+        """The present position of the handle, mm, after it has moved by `moved_mm` since the start; None if the
+        position at the start was not given."""
         return None if self.position is None else self.position + moved_mm
 
 
 def _person(no_hand: str | None, encoder_checked: bool, position: float | None) -> Any:
-    """Who answers. Raises `InputError` where nobody can, or the phrase is another."""
+    """Who answers for the person at the handle: a script if the phrase `no_hand` is given, else the terminal. Raises
+    `InputError` if the phrase differs, if there is no terminal, or for options that do not fit."""
     if no_hand is not None:
         _check_phrase(no_hand, "--no-hand-on-the-handle")
         if not encoder_checked:
@@ -140,25 +149,29 @@ def _person(no_hand: str | None, encoder_checked: bool, position: float | None) 
 
 
 def _check_phrase(given: str, what: str) -> None:
+    """Raise `InputError` unless `given` is exactly the phrase; `what` names where it came from."""
     if given != PHRASE:
         raise InputError(f'{what} is "{given}"; the device moves only after exactly "{PHRASE}".')
 
 
 def _check_position(device: Any, person: Any) -> None:
+    """Raise `InputError` if a script gives no position for a device that is not homed."""
     if isinstance(person, _Script) and person.position is None and not device.condition().homed:
         raise InputError("The device is not homed; give the current position of its handle with --position, in mm.")
 
 
 def _ask(words: str) -> None:
+    """Print words for the person on stderr, after an empty line."""
     print(f"\n{words}", file=sys.stderr, flush=True)
 
 
 def _say(words: str) -> None:
-    """A line of progress; one that changes in place would be in the way of what a person types."""
+    """Print a line of progress on stderr; a line that changes in place would disturb what a person types."""
     print(words, file=sys.stderr, flush=True)
 
 
 def _text(base: Path) -> str:
+    """The text of the header to update. Raises `InputError` if it cannot be read."""
     try:
         return base.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -166,7 +179,8 @@ def _text(base: Path) -> str:
 
 
 def _content(result: Any, damping: float, delay_us: int) -> dict[str, Any]:
-    """The result for `--json`; raises `DeviceError` for numbers that no header may have."""
+    """The result for `--json`; `damping` (N·s/m) and `delay_us` are those that the device reports. Raises `DeviceError`
+    if the measured damping is not significantly above 0."""
     from hilbo.device.failures import DeviceError
     from hilbo.identification.motor.commissioning import damping_for, delay_for
 
@@ -189,7 +203,8 @@ def _content(result: Any, damping: float, delay_us: int) -> dict[str, Any]:
 
 
 def _header(device: Any, content: dict[str, Any], base: Path | None, text: str | None) -> str:
-    """The header's text. Raises `DeviceError` for a delay that is longer than a tick."""
+    """The text of the new C header: that of `base`, `text`, with the measured values, or a whole new one if `text` is
+    None. Raises `DeviceError` for a delay that is longer than a tick."""
     from hilbo.device import messages
     from hilbo.device.config_header import header, with_measured
     from hilbo.device.failures import DeviceError
@@ -209,7 +224,7 @@ def _header(device: Any, content: dict[str, Any], base: Path | None, text: str |
 
 
 def _differences(content: dict[str, Any]) -> list[str]:
-    """Sentences where the device counts on other numbers than were measured."""
+    """Sentences for a person where the device is configured with more damping, or less delay, than was measured."""
     damping, delay, sentences = content["damping"], content["delay_us"], []
     if damping["reported"] > damping["lower"]:
         sentences.append(
@@ -225,6 +240,7 @@ def _differences(content: dict[str, Any]) -> list[str]:
 
 
 def _words(out: Path, content: dict[str, Any]) -> str:
+    """The result as lines of text; `content`: that of `_content`."""
     damping, coulomb, delay = content["damping"], content["coulomb"], content["delay_us"]
     nudges = ", ".join(f"{n['force_N']:+.2g} N: {n['moved_mm']:+.3f} mm" for n in content["nudges"])
     return (

@@ -1,6 +1,7 @@
-"""What `hilbo device` measures by itself: the line, the free device's damping, a material.
+"""The commands of `hilbo device` in which the device measures by itself: the line, its own damping, a material.
 
-Results on stdout, progress on stderr, exit codes as in `device`, which gives these commands their place.
+Results on stdout, progress on stderr; exit codes are those of `hilbo.cli.device.commands`, which registers these
+commands.
 """
 
 import sys
@@ -22,7 +23,10 @@ _FOAM = (-2.89, 5.70, 5.89, 0.203, 101)  # what lies under a simulated device th
 def selftest(
     line: Line, echoes: Annotated[int, typer.Option(min=1, help="Round trips.")] = 300, as_json: JsonToo = False
 ) -> None:
-    """Loopback, latency, and whether the device lets go when the host falls silent."""
+    """Test the line (loopback, latency), the delay, and that the device releases its force when the host falls silent.
+
+    Exit code 1 if the device has not passed.
+    """
     from hilbo.identification.motor import device_tests
 
     with progress() as say, opened(line, finger="none") as device:
@@ -51,7 +55,7 @@ def selftest(
 def measure_damping(
     line: Line, seed: Annotated[int, seed_option("of the motion")] = 0, as_json: JsonToo = False
 ) -> None:
-    """Damping b and friction of the free device by the law that fits, with 95 % intervals. It moves by itself."""
+    """Measure damping b and friction of the free device, with 95 % intervals. The device moves by itself."""
     from hilbo.device.handshake import shortest
     from hilbo.identification.motor import device_tests
 
@@ -82,7 +86,8 @@ def measure_damping(
 
 
 def _advice(damping: float) -> str:
-    """The damping (N·s/m) that studies may assume, rounded down."""
+    """Advice on the damping (N·s/m) that studies may assume: the given one rounded down, or to measure again where it
+    is not above 0."""
     if damping <= 0:
         return "the measurement does not tell it from 0: measure again, with the handle free, and plan no study before."
     from hilbo.identification.motor.commissioning import rounded_down
@@ -104,7 +109,10 @@ def characterise(
     force: ForceFile = False,
     as_json: JsonToo = False,
 ) -> None:
-    """Relaxation and creep of a material at position 0, pressed by the device itself."""
+    """Measure relaxation and creep of a material at position 0, pressed by the device itself.
+
+    Writes the tests to a CSV file for `hilbo identify`.
+    """
     from hilbo.device.failures import DeviceError
     from hilbo.device.handshake import shortest
     from hilbo.identification.motor import device_tests

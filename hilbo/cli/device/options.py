@@ -1,7 +1,7 @@
 """Options that the commands of `hilbo device` share: which device, and which parameter set.
 
-`takes` gives a command the options of a group and hands it their values in one record. Whatever fails on the way to
-the device or there is one sentence and exit code 1; bad input, refused numbers included, is exit code 2 (`cli.main`).
+`takes` gives a command the options of a group and hands it their values in one record. A failure of the device or the
+line is one sentence and exit code 1; bad input, including refused numbers, is exit code 2 (`cli.main`).
 """
 
 import contextlib
@@ -42,7 +42,7 @@ _Number = float | None
 
 
 class Line(NamedTuple):
-    """The device, and the damping that it must have."""
+    """The device and its line, and the damping that it must have."""
 
     device: Where = "sim"
     baud: Baud = 921_600
@@ -54,7 +54,7 @@ class Line(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """One parameter set, by its numbers or from a table."""
+    """One parameter set, by its numbers or from a table; all None: no set."""
 
     K0: Annotated[_Number, typer.Option("--K0", help="N/mm; else from --K-eff.")] = None
     K1: Annotated[_Number, typer.Option("--K1", help="N/mm.")] = None
@@ -71,7 +71,8 @@ class Chosen(NamedTuple):
 
 
 def takes(**groups: type) -> Callable:
-    """Gives a command the options of these records, and hands it the records under these names."""
+    """A decorator that adds the options of these records (name of a parameter = NamedTuple) to a command, which gets
+    the records themselves. A `DeviceError` of the command ends the process with one sentence and exit code 1."""
 
     def decorate(command: Callable) -> Callable:
         kept = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.name not in groups]
@@ -98,9 +99,11 @@ def takes(**groups: type) -> Callable:
 
 @contextlib.contextmanager
 def opened(line: Line, **simulated: Any) -> Iterator[Any]:
-    """A connected `Renderer`, stopped at the end also when the process is told to terminate.
+    """A connected `Renderer`, stopped at the end also when the process is told to terminate; the device's notes are
+    printed on stderr.
 
-    `simulated` are options of the simulated device that suit the command, where the user gives no others.
+    `simulated` are options of the simulated device that suit the command, where the user gives no others. Raises
+    `InputError`, and `DeviceError` for a device that fails or has too little damping.
     """
     from hilbo.hardware_bridge import Renderer
 
@@ -126,7 +129,7 @@ def opened(line: Line, **simulated: Any) -> Iterator[Any]:
 
 
 def simulator(line: Line) -> Any:
-    """A simulated device alone."""
+    """A started simulated device without a connection to it. Raises `InputError` if a real device is named."""
     from hilbo.device.local.simulator import Simulator
 
     if line.device != "sim":
@@ -138,7 +141,8 @@ _OF_A_SET = ("K0", "K1", "B1", "alpha", "N", "T", "memory", "states", "force_lim
 
 
 def chosen_set(chosen: Chosen, line: Line) -> dict[str, Any] | None:
-    """What `Renderer.send` takes, or None where no set is chosen."""
+    """The chosen set as arguments of `Renderer.send`, or None if none is chosen. Numbers given override those of the
+    table. Raises `InputError` for a set that is incomplete or not in the table."""
     given = {name: value for name in _OF_A_SET if (value := getattr(chosen, name)) is not None}
     if chosen.sets is not None:
         named_sets = sets_of(chosen.sets, line, chosen.K_eff)
@@ -157,7 +161,7 @@ def chosen_set(chosen: Chosen, line: Line) -> dict[str, Any] | None:
 
 
 def sets_of(path: Path, line: Line, K_eff: float | None = None) -> dict[str, dict[str, Any]]:
-    """Every set of a table, as `Renderer.send` takes them."""
+    """Name -> set, as arguments of `Renderer.send`, for all sets of a table. Raises `InputError`."""
     from hilbo.study.tables.parameter_sets import read_sets
 
     return {
@@ -167,7 +171,8 @@ def sets_of(path: Path, line: Line, K_eff: float | None = None) -> dict[str, dic
 
 
 def _whole(given: dict[str, Any], line: Line, K_eff: float | None) -> dict[str, Any]:
-    """A complete set: memory from the study where it is not given, K0 from the effective stiffness."""
+    """The set completed: N, T and memory from the study or the defaults, K0 (N/mm) from the effective stiffness
+    `K_eff`, by default the study's or 0.44."""
     mechanics = _mechanics(line)
     values = {} if mechanics is None else {n: getattr(mechanics, n) for n in ("N", "T", "memory", "states")}
     values = {"N": 101, "T": 1e-3, "memory": "short"} | values | given
@@ -184,7 +189,8 @@ def _whole(given: dict[str, Any], line: Line, K_eff: float | None) -> dict[str, 
 
 
 def _mechanics(line: Line) -> Any:
-    """The mechanics of the study that is given, None without one. Raises `InputError` for a study without any."""
+    """The mechanics of the study that is given, None without one. Raises `InputError` for a study without a
+    [renderer]."""
     if line.study is None:
         return None
     from hilbo.study.file.reading import StudyFile
@@ -196,7 +202,8 @@ def _mechanics(line: Line) -> Any:
 
 
 def sim_options(pairs: list[str] | None) -> dict[str, Any]:
-    """Options of the simulated device, from KEY=VALUE."""
+    """Options of the simulated device by name, from texts KEY=VALUE; yes and no become booleans. Raises `InputError`
+    for other text."""
     options: dict[str, Any] = {}
     for pair in pairs or ():
         name, separator, value = pair.partition("=")
@@ -210,7 +217,8 @@ def sim_options(pairs: list[str] | None) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _capture(path: Path) -> Iterator[BinaryIO]:
-    """A new file for the bytes of the line."""
+    """A new binary file for the bytes of the line, closed at the end. Raises `InputError` if it exists or cannot be
+    written."""
     try:
         file = open(path, "xb")  # noqa: SIM115
     except OSError as error:

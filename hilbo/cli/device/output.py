@@ -6,7 +6,7 @@ __all__ = ["condition_words", "decoded", "said", "set_words"]
 
 
 def said(name: str, value: Any) -> str:
-    """A field of the answer to HELLO as text."""
+    """A field of the answer to HELLO as text; hashes and ids in hexadecimal."""
     if name in ("schema", "firmware", "boot_id"):
         return f"{value:08x}"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
@@ -34,7 +34,8 @@ def set_words(current) -> str:
 
 
 def decoded(row: dict[str, Any]) -> str:
-    """A frame of a capture in a line: its byte, its number, its message or what is wrong."""
+    """A frame of a capture as a line: its first byte, its number, its message or what is wrong. `row`: as `hilbo device
+    decode` prints it with --json."""
     seq = "  -" if row["seq"] is None else f"{row['seq']:3}"
     if row["message"] is None:
         return f"{row['byte']:8} {seq}  ?  {row['wrong']}"
@@ -43,6 +44,7 @@ def decoded(row: dict[str, Any]) -> str:
 
 
 def _field(value: Any) -> str:
+    """A value of a message as text; tuples as groups in parentheses."""
     if isinstance(value, bytes):
         return value.hex()
     if isinstance(value, float):

@@ -40,7 +40,8 @@ _REPORTED = (
 
 
 def trace(values: Any, width: int) -> str:
-    """A row of bars from the lowest to the highest value; each bar is the largest excursion of its share."""
+    """A line of `width` bars, from the lowest value to the highest, 0 included; each bar is the value farthest from 0
+    of its share of the values. Values that are not finite are left out; without any the line is blank."""
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
     if values.size == 0:
@@ -53,7 +54,7 @@ def trace(values: Any, width: int) -> str:
 
 
 class _View:
-    """What is on the screen: the last status and the last seconds of telemetry."""
+    """What is on the screen: the last status, and the last seconds of telemetry."""
 
     def __init__(self, device: Renderer, title: str):
         self.device, self.title = device, title
@@ -67,6 +68,7 @@ class _View:
         self.status = device.status()
 
     def refresh(self) -> None:
+        """Read new samples, the status and the sentences that the device sent. Raises `DeviceError`."""
         new = self.device.samples(0.0)
         self.position.extend(new.position_mm)
         self.force.extend(new.force_N)
@@ -78,6 +80,7 @@ class _View:
         self.words.extend(self.device.events())
 
     def line(self) -> str:
+        """The status as one line."""
         s = self.status
         state = meaning(State, s.state) + (f" ({held_because(s.hold_reason)})" if s.state >= State.HOLD else "")
         faults = ("" if s.flags & DeviceFlag.HOMED else "  not homed") + (
@@ -86,6 +89,7 @@ class _View:
         return f"tick {s.tick}  {state}  set {s.active_id}  {s.position_mm:8.3f} mm  {s.force_N:7.3f} N{faults}"
 
     def panel(self, width: int) -> Group:
+        """The whole picture for a terminal that is `width` characters wide."""
         width = max(20, min(width - 26, 100))
         table = Table(box=box.SIMPLE_HEAD, show_header=False, pad_edge=False)
         table.add_row("", self.line())
@@ -108,7 +112,7 @@ class _View:
         return Group(Text(self.title), table, *(Text(word) for word in self.words[-4:]))
 
     def summary(self) -> dict[str, Any]:
-        """The content for `--json`."""
+        """The content for `--json`: the last status, the set, and counts."""
         status = self.status
         return {
             "state": meaning(State, status.state),
@@ -122,12 +126,15 @@ class _View:
 
 
 def watch(device: Renderer, seconds: float | None, title: str = "Ctrl-C ends") -> dict[str, Any]:
-    """Show the device until Ctrl-C, for so many `seconds` of its time, or until it is in HOLD; returns a summary."""
+    """Show the device until Ctrl-C, or for so many `seconds` of its time (None: without end); returns a summary."""
     return _show(_View(device, title), seconds, lambda: True)
 
 
 def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float | None) -> dict[str, Any]:
-    """Keys 1 to 9 put sets in force, space starts and stops, e is the emergency stop, c clears, q ends."""
+    """Show the device and obey keys: 1 to 9 put the sets in force, space starts and stops, e is the emergency stop, c
+    clears, q ends. Returns the summary with the names of the sets felt and the messages. Ends also after `seconds` of
+    the device's time. Raises `InputError` for no set, too many, or one that the device refuses, `DeviceError` if the
+    line is lost."""
     if not sets or len(sets) > len(_KEYS):
         raise InputError(f"There are {len(sets)} sets; between 1 and {len(_KEYS)} can be felt, one on each key.")
     for values in sets.values():
@@ -163,7 +170,8 @@ def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float
 def _press(
     device: Renderer, view: _View, key: str, names: list[str], sets: Mapping[str, Mapping[str, Any]], felt: list[str]
 ) -> None:
-    """Carry out a key; the name of a set that it puts in force is appended to `felt`."""
+    """Carry out a key; the name of a set that it puts in force is appended to `felt`. Space while stopped only requests
+    the start, which `_start_when_free` carries out."""
     if key in _KEYS[: len(names)]:
         name = names[_KEYS.index(key)]
         view.set = device.send(**sets[name])
@@ -184,7 +192,7 @@ def _press(
 
 
 def _start_when_free(device: Renderer, view: _View) -> None:
-    """Start what the space bar asked for, unless the handle is still in the material."""
+    """Carry out the start that was requested, unless the handle is in the material: then it stays requested."""
     stop, view.start_after = view.start_after, None
     try:
         device.start(stop=stop, wait=0.0)
@@ -195,7 +203,8 @@ def _start_when_free(device: Renderer, view: _View) -> None:
 
 
 def _show(view: _View, seconds: float | None, go_on: Callable[[], bool]) -> dict[str, Any]:
-    """Update the view until `go_on` returns False, or for so many `seconds` of the device's time."""
+    """Update the view until `go_on` returns False, Ctrl-C, or `seconds` of the device's time (None: without end);
+    returns its summary. In place on a terminal, else one line a second."""
     console = Console(stderr=True, highlight=False, markup=False)
     first, painted = view.status.tick, 0.0
     with contextlib.ExitStack() as stack:
@@ -220,8 +229,9 @@ def _show(view: _View, seconds: float | None, go_on: Callable[[], bool]) -> dict
 
 @contextlib.contextmanager
 def _keyboard() -> Iterator[Callable[[], Iterator[str]]]:
-    """A function that returns the keys pressed since the last call, without waiting; of a pipe one key every half a
-    second, and "q" at its end."""
+    """A function that returns the keys pressed since the last call, without waiting; of a pipe one key at every fifth
+    call, and "q" at its end. The terminal's mode is restored at the end. Raises `DeviceError` on a system without POSIX
+    terminals."""
     if not sys.stdin.isatty():
         calls = itertools.count()
         yield lambda: iter("" if next(calls) % _PIPED else sys.stdin.read(1) or "q")
@@ -241,7 +251,7 @@ def _keyboard() -> Iterator[Callable[[], Iterator[str]]]:
 
 
 def _waiting(file: int) -> Iterator[str]:
-    """The keys that wait in a terminal."""
+    """The keys that were pressed in a terminal and not read yet."""
     while select.select([file], [], [], 0)[0]:
         data = os.read(file, 1)
         if not data:

@@ -1,4 +1,4 @@
 """What every command does around its work: float64, caches, progress, a results folder that is whole or absent.
 
-Knows no command.
+Depends on no command.
 """

@@ -63,15 +63,16 @@ _EVERY = 10.0  # s
 
 
 def seed_option(what: str) -> Any:
-    """The option --seed of a command, for `Annotated`; `what` it decides ends its help."""
+    """The option --seed of a command, for `Annotated`; its help is "Random seed" and `what`."""
     return typer.Option("--seed", min=0, max=2**31 - 1, help=f"Random seed {what}.")
 
 
 def start(devices: int | None = None) -> None:
-    """Float64, and compiled programs kept in the user's cache folder from one command to the next.
-    HILBO_KEEP_PROGRAMS=0 traces and compiles them anew.
+    """Load JAX with float64, and keep compiled functions in the user's cache folder from one command to the next,
+    unless HILBO_KEEP_PROGRAMS=0. Sets environment variables, JAX's settings and the thresholds of garbage collection;
+    to be called before JAX computes.
 
-    `devices`: as how many devices the CPU is to count.
+    `devices`: number of devices that JAX makes of the CPU.
     """
     # Matrices are small here: a second thread of OpenBLAS, which reads this once, keeps a core busy by waiting.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -94,12 +95,13 @@ def start(devices: int | None = None) -> None:
 
 
 def cache_folder() -> Path:
-    """Where programs are kept: for this user, and for all studies."""
+    """The folder of cached functions, one for this user and all studies; it may not exist."""
     return Path(os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")) / "hilbo"
 
 
 def _compiled_programs() -> Path | None:
-    """Folder in which JAX keeps compiled programs; None if another user may have put machine code there."""
+    """The folder in which JAX keeps compiled functions, made if there is none; None, with a remark on stderr, if
+    another user may have written to it."""
     from hilbo.programs.private import private_folder
 
     folder = cache_folder() / "jax"
@@ -112,6 +114,7 @@ def _compiled_programs() -> Path | None:
 
 
 def _keep_programs() -> None:
+    """Keep hilbo's traced and compiled functions in the cache folder, for this process."""
     from hilbo.numerics.tracing import keep_with
     from hilbo.programs.entries import Entries
     from hilbo.programs.keeping import Programs
@@ -121,7 +124,8 @@ def _keep_programs() -> None:
 
 @contextlib.contextmanager
 def orderly() -> Iterator[None]:
-    """SIGTERM ends the command as Ctrl-C does: a device is told to stop, and nothing half written is left behind."""
+    """Within the block SIGTERM raises `SystemExit` (143), so that it ends the command as Ctrl-C does: a device is
+    stopped, and no half-written file is left."""
 
     def end(_number, _frame):
         raise SystemExit(143)
@@ -135,8 +139,8 @@ def orderly() -> Iterator[None]:
 
 @contextlib.contextmanager
 def results(out: Path, force: bool) -> Iterator[Path]:
-    """A new folder that becomes `out` when everything in it is complete; with a list of what it holds, so that
-    `force` replaces nothing else later."""
+    """A new folder that becomes `out` when the block ends well, with a list of its files; by it, `force` later replaces
+    only files that hilbo wrote. After an error nothing is left. Raises `InputError` if `out` may not be replaced."""
     from hilbo.report.figures.painter import begin_painter
     from hilbo.study.disk.new_folder import new_folder
     from hilbo.study.results.listing import list_files
@@ -149,7 +153,8 @@ def results(out: Path, force: bool) -> Iterator[Path]:
 
 
 def _check_free(out: Path, force: bool) -> None:
-    """Refuse to replace anything without `force`, and with it anything that is not hilbo's."""
+    """Raise `InputError` if the folder `out` may not be replaced: a file, a folder with content without `force`, and
+    with it one with files that hilbo did not write or that have been changed."""
     if not out.exists():
         return
     if not out.is_dir():
@@ -169,13 +174,16 @@ def _check_free(out: Path, force: bool) -> None:
 
 
 class Say:
-    """Told what is being done and, where that is counted, how many are done already, and of how many."""
+    """Progress of a command: called with what is being done and, where that is counted, how many are done, and of how
+    many. `printed`: the sentences of `tell`."""
 
     def __init__(self, console: Any, status: Any):
         self._console, self._status, self._pace = console, status, _Pace()
         self.printed: list[str] = []
 
     def __call__(self, text: str, done: int | None = None, people: int | None = None) -> None:
+        """Show progress: on a terminal in the changing line, else as a line if it is new, or `_EVERY` s after the
+        last."""
         line, new = self._pace.line(text, done, people, time.perf_counter())
         if self._console.is_terminal:
             self._status.update(line)
@@ -183,7 +191,7 @@ class Say:
             self._console.print(line)
 
     def tell(self, sentences: list[str]) -> None:
-        """Results that are known before the others; they stay on a terminal too."""
+        """Print sentences that stay on a terminal too: results that are known before the others."""
         self.printed += sentences
         for sentence in sentences:
             self._console.print(sentence)
@@ -191,8 +199,9 @@ class Say:
 
 @contextlib.contextmanager
 def progress(quiet: bool = False) -> Iterator[Say]:
-    """Says on stderr what is being done: in one changing line on a terminal, else in a line for each thing, or every
-    ten seconds for one that takes longer. `quiet`: says nothing, for the processes whose results are not written."""
+    """Show on stderr what is being done, in one changing line on a terminal, else in a line for each step, or every ten
+    seconds within one; at the end, how long it took. `quiet`: print nothing, for the processes whose results are not
+    written."""
     from rich.console import Console
 
     console, begun = Console(stderr=True, highlight=False, markup=False, soft_wrap=True), time.perf_counter()
@@ -203,13 +212,14 @@ def progress(quiet: bool = False) -> Iterator[Say]:
 
 
 class _Pace:
-    """The words for work that goes by participants: how many are done, and how long the others will take."""
+    """The text of progress for work that is counted, with an estimate of the time left."""
 
     def __init__(self) -> None:
         self.text, self.done, self.first, self.last_shown = "", 0, (0, 0.0), -math.inf
 
     def line(self, text: str, done: int | None, people: int | None, now: float) -> tuple[str, bool]:
-        """The line, and whether it is news where there is no line that changes."""
+        """The line at the time `now` (s), and whether to print it where lines cannot change: a new text, or `_EVERY` s
+        since the last. `done` of `people` (None: not counted, or total unknown)."""
         if done is None:
             self.text = text
             return text, True
@@ -229,7 +239,8 @@ class _Pace:
 
 
 def check_choice(option: str, value: Any, allowed: Collection[Any]) -> None:
-    """Raises InputError where an option has none of its values; None among them is one that was not given."""
+    """Raise `InputError` if an option's value is not allowed; None among the `allowed` stands for an option that was
+    not given."""
     if value not in allowed:
         names = [str(name) for name in allowed if name is not None]
         listed = f"one of {', '.join(names)}" if len(names) > 2 else " or ".join(names)
@@ -237,7 +248,8 @@ def check_choice(option: str, value: Any, allowed: Collection[Any]) -> None:
 
 
 def finish(content: dict[str, Any], out: Path, as_json: bool, printed: Collection[str] = ()) -> None:
-    """The last words of a command: warnings that were not told before, then result.json or the way to the report."""
+    """End a command: print the result's warnings that were not `printed` before on stderr, then result.json on stdout
+    (`as_json`) or the path of the report on stderr."""
     for warning in content.get("warnings", []):
         if warning not in printed:
             remark(warning)
@@ -249,7 +261,7 @@ def finish(content: dict[str, Any], out: Path, as_json: bool, printed: Collectio
 
 
 def print_result(content: Any, words: str, as_json: bool) -> None:
-    """A result without a folder, for a machine or in words, on stdout."""
+    """Print a result on stdout, as JSON (`as_json`) or in `words`; nothing for empty words."""
     if as_json:
         print(json.dumps(content, indent=2, allow_nan=False, default=float))
     elif words:
@@ -257,12 +269,13 @@ def print_result(content: Any, words: str, as_json: bool) -> None:
 
 
 def remark(sentence: str) -> None:
-    """One sentence on stderr."""
+    """Print one sentence on stderr, after "hilbo: "."""
     print(f"hilbo: {sentence}", file=sys.stderr)
 
 
 def say_remarks(show: Callable[..., None]) -> Callable[..., None]:
-    """`warnings.showwarning` that says an `InputRemark` in its one sentence, and everything else as `show` does."""
+    """A replacement for `warnings.showwarning` that prints an `InputRemark` as one sentence on stderr, and passes all
+    other warnings to `show`."""
 
     def said(message: Warning | str, category: type[Warning], *where: Any) -> None:
         if issubclass(category, InputRemark):
@@ -274,6 +287,6 @@ def say_remarks(show: Callable[..., None]) -> Callable[..., None]:
 
 
 def fail(sentence: str, code: int) -> NoReturn:
-    """One sentence on stderr, and the end."""
+    """Print one sentence on stderr, and end the process with this exit code."""
     remark(sentence)
     sys.exit(code)

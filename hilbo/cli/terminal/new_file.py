@@ -1,4 +1,4 @@
-"""A file that a command makes: never over another one unasked, and whole or not at all."""
+"""A new file of a command: written whole or not at all, and never over another file without `--force`."""
 
 import contextlib
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ __all__ = ["check_free", "new_file", "write_new"]
 
 
 def check_free(out: Path, force: bool) -> None:
-    """Raises `InputError` where `out` cannot be written, or would be overwritten without `force`."""
+    """Raise `InputError` if `out` cannot be written, or would be overwritten without `force`."""
     if out.exists() and not out.is_file():
         raise InputError(f"{out}: is no file; choose another one.")
     if out.exists() and not force:
@@ -24,8 +24,8 @@ def check_free(out: Path, force: bool) -> None:
 
 @contextlib.contextmanager
 def new_file(out: Path, force: bool) -> Iterator[Path]:
-    """A path beside `out` to write to, which takes its place when the block ends well. Raises `InputError`, also where
-    something has the name by then and `force` is not given."""
+    """A path beside `out` to write to, which is renamed to `out` when the block ends well, and removed otherwise.
+    Raises `InputError` if that fails, also where `out` exists by then and `force` is not given."""
     try:
         with disk.new_file(out, replace=force) as unfinished:
             yield unfinished
@@ -36,10 +36,11 @@ def new_file(out: Path, force: bool) -> Iterator[Path]:
 
 
 def write_new(out: Path, text: str, force: bool) -> None:
-    """Write a whole file, as `new_file` does. Raises `InputError`."""
+    """Write a whole UTF-8 file, as `new_file` does. Raises `InputError`."""
     with new_file(out, force) as path:
         path.write_text(text, encoding="utf-8")
 
 
 def _exists(out: Path) -> str:
+    """The error sentence for a file that exists."""
     return f"{out}: exists already; choose another file, or add --force to replace it."
