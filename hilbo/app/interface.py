@@ -35,7 +35,7 @@ class RunnerInterface(Protocol):
         """Cancel the present work and start again from the current state."""
 
     def wake(self) -> None:
-        """Check the awaited condition again."""
+        """Have the task check the condition that it waits for (Begin, or the rig) again."""
 
     def forget(self) -> None:
         """Record that the rig has no rendering in force, so that the next one is prepared again."""
@@ -105,7 +105,7 @@ class HubInterface(Protocol):
 
     @property
     def lost(self) -> bool:
-        """Whether the log's file is lost, which ends the session."""
+        """Whether the log's file is lost; nothing is presented any more."""
         ...
 
     @property

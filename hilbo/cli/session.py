@@ -53,7 +53,10 @@ def plan(
     force: ForceFile = False,
     as_json: JsonToo = False,
 ) -> None:
-    """Plan a whole study in advance: orders, seeds and validation sets, with a hash that every log will hold."""
+    """Plan a whole study in advance: orders, seeds and validation sets, with a hash that every log will hold.
+
+    Writes the plan to --out; with --reissue changes the plan there.
+    """
     from hilbo.study.file.protocols import PHASES
     from hilbo.study.file.reading import StudyFile
 

@@ -116,8 +116,8 @@ class Interruptions:
                 self._unwritten.popleft()
 
     async def _watch(self, what: str, look: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Call `look` every `_LATER` s, also after it failed, and report its fault under the name `what`. Each watch is
-        a task of its own: a slow disk must not look like a laptop that slept."""
+        """Call `look` every `_LATER` s until cancelled, also after it failed, and set or clear its fault under the name
+        `what`. Each watch is a task of its own: a slow disk must not look like a laptop that slept."""
         while True:
             await asyncio.sleep(_LATER)
             try:

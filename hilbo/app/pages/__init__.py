@@ -1,4 +1,4 @@
 """What participant and experimenter are shown of a session, as plain data for their pages.
 
-Pure functions of the session's state and the log.
+It is made from the session's state, log, rig and runner; nothing here changes them.
 """

@@ -188,7 +188,8 @@ class StimulusRig:
             self._confirmation.set_result(Loaded({"values": values, "took_s": took, **self._program_facts()}, took))
 
     def _neutral(self, order: Order) -> None:
-        """Record that the program presents nothing, which acknowledges a stop."""
+        """Record that the program presents nothing, which acknowledges a stop: the first one, after hello, makes the
+        program available; the duration of each is kept. Nothing while `order` is to present."""
         self._cancel_timer("neutral")
         if order.do == "present":
             return
@@ -324,7 +325,8 @@ class StimulusRig:
             timer.cancel()
 
     def _drop_program(self, words: str) -> None:
-        """Drop the program, which must say hello again, for the reason `words`."""
+        """Drop the program, for the reason `words`: it is lost until it says hello again, `show` fails, and the order
+        is neutral."""
         for what in list(self._timers):
             self._cancel_timer(what)
         self._run = ""

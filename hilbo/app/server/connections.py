@@ -164,6 +164,7 @@ class Connection(H11Protocol):
             self._limit = self.loop.call_later(PATIENCE, self.abort)
 
     def _stop_timer(self) -> None:
+        """Cancel the timer of `_start_timer`, if it runs."""
         if self._limit is not None:
             self._limit.cancel()
             self._limit = None

@@ -327,6 +327,7 @@ def _page_of(request: Request) -> str | None:
 
 
 def _json(content: Any, status: int = 200) -> Response:
+    """A response with the content as JSON."""
     return Response(msgspec.json.encode(content), status, media_type="application/json")
 
 
@@ -336,4 +337,5 @@ def _not_understood(error: InputError) -> Response:
 
 
 def _error(status: int, sentence: str) -> Response:
+    """A response {"error": sentence} with this status."""
     return _json({"error": sentence}, status)

@@ -77,7 +77,7 @@ def hello(line: Line, as_json: JsonToo = False) -> None:
 @app.command("set")
 @takes(chosen=Chosen, line=Line)
 def set_(chosen: Chosen, line: Line, as_json: JsonToo = False) -> None:
-    """Put a set in force, and read it back bit for bit. Nothing is started."""
+    """Put a set in force, read it back bit for bit, and print it. Nothing is started."""
     wanted = chosen_set(chosen, line)
     if wanted is None:
         raise InputError("No set is given; a set has --K1, --B1 and --alpha, or --sets and --name.")
@@ -89,7 +89,10 @@ def set_(chosen: Chosen, line: Line, as_json: JsonToo = False) -> None:
 @app.command()
 @takes(chosen=Chosen, line=Line)
 def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: JsonToo = False) -> None:
-    """Render the set that is in force, or the one that is given, until Ctrl-C; then stop."""
+    """Render the set that is in force, or the one that is given, until Ctrl-C; then stop.
+
+    Exit code 1 if the device is then in HOLD or ESTOP.
+    """
     from hilbo.cli.device.screen import watch
 
     wanted = chosen_set(chosen, line)
@@ -118,7 +121,7 @@ def estop(line: Line, as_json: JsonToo = False) -> None:
 @app.command()
 @takes(line=Line)
 def clear(line: Line, as_json: JsonToo = False) -> None:
-    """Leave HOLD or ESTOP, once the reason is understood."""
+    """Leave HOLD or ESTOP, once the reason is understood, and print the state."""
     with opened(line) as device:
         device.clear()
         state = device.state().name

@@ -61,7 +61,10 @@ def commission(
     force: ForceFile = False,
     as_json: JsonToo = False,
 ) -> None:
-    """Check the signs of encoder and motor with little energy, home, measure delay and damping, write the C header."""
+    """Check the signs of encoder and motor with little energy, home, measure delay and damping, write the C header.
+
+    The device moves by itself. A person at the terminal is asked to help, or a script gives the answers as options.
+    """
     from hilbo.identification.motor.commissioning import Bounds
     from hilbo.identification.motor.commissioning import commission as commissioned
 
