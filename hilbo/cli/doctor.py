@@ -144,7 +144,7 @@ def _serial_ports() -> Check:
 
 
 def _study_file(path: Path) -> tuple[Check, Any]:
-    """Whether the study file is valid, and the file, or None."""
+    """The check that the study file is valid, and the file, None if it is not."""
     from hilbo.study.file.reading import StudyFile
 
     try:
@@ -180,7 +180,8 @@ def _precision() -> Check:
 
 
 def _study(path: Path) -> Iterator[Check]:
-    """Checks of the feasible set and of the time of a step; one failed check if the study cannot be loaded."""
+    """Checks of the feasible set (not for a study with [stimulus] and without constraints) and of the time of a step;
+    one failed check if the study cannot be loaded."""
     from hilbo.study.config import Study
 
     try:

@@ -3,7 +3,8 @@
     device, clocks, signs of life --> event in the log --> the runner restarts
 
 The rig reports what happens to a device (lost, HOLD, ESTOP, ready again); here that becomes an event of the pending
-trial. After an interruption the participant must press Begin.
+trial. After an interruption the participant must press Begin, except after a HOLD or ESTOP, which the experimenter
+clears.
 """
 
 import asyncio

@@ -107,7 +107,7 @@ def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: JsonToo 
 @app.command()
 @takes(line=Line)
 def stop(line: Line, as_json: JsonToo = False) -> None:
-    """Force to zero, smoothly, even if another program started it."""
+    """Force to zero, smoothly, even if another program started it; prints that it is done."""
     _at_once(line, "Stop", as_json)
 
 
@@ -131,7 +131,7 @@ def clear(line: Line, as_json: JsonToo = False) -> None:
 @app.command()
 @takes(line=Line)
 def monitor(line: Line, seconds: Seconds = None, as_json: JsonToo = False) -> None:
-    """Show state, force and position as they change. Nothing is started."""
+    """Show state, force and position as they change, until Ctrl-C. Nothing is started."""
     from hilbo.cli.device.screen import watch
 
     with opened(line) as device:
