@@ -1,5 +1,5 @@
-"""A participant's session: what is asked next, the state as the fold of a log on disk, plans for whole studies, and the
-logs as tables.
+"""A participant's session: choice of the next trial, the event log on disk and the state computed from it, plans for
+whole studies, export of logs as tables, and withdrawal.
 
-Imports `study`, `search` and the model; knows no device and no server.
+Imports `study`, `search` and the model, but no device and no server.
 """

@@ -33,9 +33,11 @@ _LARGEST_SEED = 2**63 - 1  # of JAX's keys
 
 
 def physical_trials(study: Study, points: np.ndarray, answers: np.ndarray, capacity: int) -> Trials:
-    """Trials from points (n, d) in physical units: the one way from what tables and logs hold to what a fit sees.
+    """Trials of `capacity` rows from n points (n, d) in physical units and their categories (n,); further rows are
+    masked.
 
-    Rows beyond n are put in the middle of the box before the change of coordinates, so that it compiles once.
+    Tables and logs are always converted by this function before a fit. The further rows are in the middle of the box
+    before the change of coordinates, so that it compiles once.
     """
     padded, categories = padding(study, capacity), np.zeros(capacity, np.int32)
     padded[: len(points)], categories[: len(answers)] = points, answers
@@ -44,6 +46,7 @@ def physical_trials(study: Study, points: np.ndarray, answers: np.ndarray, capac
 
 @program
 def _to_unit(space, physical):
+    """Points from physical units to the unit cube."""
     return space.to_unit(physical)
 
 
@@ -93,7 +96,8 @@ class Session:
 
     @classmethod
     def replay(cls, study: Study, responses: Iterable[str], seed: int = 0) -> "Session":
-        """The session in which these answers were given, in this order."""
+        """Session after these responses to its proposals, in this order. Raises `InputError` as `start` and `tell`
+        do."""
         session = cls.start(study, seed)
         for response in responses:
             session = session.tell(response)
@@ -101,7 +105,7 @@ class Session:
 
     @property
     def trials(self) -> Trials:
-        """The answers as the model's data, with the capacity of the whole session."""
+        """The answers as the model's data, masked and with the capacity of the whole session."""
         return physical_trials(self.study, self.points, self.answers, self.study.file.selection.trials)
 
     @property
@@ -110,24 +114,26 @@ class Session:
         return self.proposal is None
 
     def warm(self) -> threading.Thread:
-        """Compile the step that chooses points, in a thread: while the first, given points are answered."""
+        """Compile the step that chooses points in a new thread, which is returned: while the first points are
+        answered."""
         thread = threading.Thread(target=self.step.warm, daemon=True)
         thread.start()
         return thread
 
     def ask(self) -> dict[str, Any]:
-        """The rendering to present next: parameter -> value in physical units, of levels the name of one.
+        """The rendering to present next: parameter -> value in physical units, levels by name; the same until `tell`.
 
-        Raises `InputError` where all trials of the study are answered.
+        Raises `InputError` once all trials of the study are answered.
         """
         return self._named(_asked(self))
 
     def tell(self, response: str, at: Mapping[str, Any] | pd.Series | None = None) -> "Session":
-        """The next state, after the participant's answer (one of the study's responses) to the asked point.
+        """The next state, after the participant's response (one of the study's) to the asked rendering; `self` is
+        unchanged.
 
-        `at`: the point that was really presented, if it was not the asked one: each parameter's value by its name, as
-        `ask` has one, or a row of a DataFrame.
-        Raises `InputError` for a `response` that the study does not have, and a point that is none of its own.
+        `at`: the rendering that was really presented, if it differs: each parameter's value by its name, as `ask` has
+        one, or a row of a DataFrame. Raises `InputError` for an unknown `response`, a rendering with other parameters
+        or values out of range, and without `at` once all trials are answered.
         """
         step = self.step
         if response not in step.responses:
@@ -140,12 +146,13 @@ class Session:
         return replace(self, points=points, answers=answers, proposal=step(points, answers))
 
     def _named(self, point: np.ndarray) -> dict[str, Any]:
-        """Physical numbers (d,) by the parameters' names, and levels by their own."""
+        """Physical numbers (d,) by the parameters' names; levels by their own names."""
         values = zip(self.study.space.parameters, point.tolist(), strict=True)
         return {p.name: p.shown(value) if p.levels else value for p, value in values}
 
     def _point(self, at: Mapping[str, Any] | pd.Series) -> np.ndarray:
-        """A rendering (d,) that was presented. Raises `InputError` for one that is none of this study's."""
+        """Convert a rendering that was presented to numbers (d,). Raises `InputError` for other parameters or values
+        out of range."""
         names = ", ".join(self.step.names)
         if not isinstance(at, Mapping | pd.Series):
             raise InputError(f"Session: at is a {type(at).__name__}; give a dict with a value for each of {names}.")
@@ -161,19 +168,20 @@ class Session:
         return np.array([_in_its_digits(p, at[p.name]) for p in self.study.space.parameters])
 
     def posterior(self) -> Posterior:
-        """The participant's posterior after the answers so far."""
+        """Fit the answers so far, and return the participant's posterior."""
         return fit(self.study.gp, self.trials, inference=self.study.inference)
 
     def best(self) -> dict[str, Any]:
-        """The rendering with the largest posterior mean, as `ask` has one. Raises `InputError`
-        before the first answer: the prior mean is the same everywhere."""
+        """The rendering with the largest posterior mean, in the form of `ask`; computed with a fit. Raises `InputError`
+        before the first answer, when the prior mean is the same everywhere."""
         if not len(self.answers):
             raise InputError("Session: there are no answers yet, and so no best rendering; tell one first.")
         return self._named(self.step.best(self.posterior()))
 
 
 def _in_its_digits(parameter: Parameter, value: Any) -> float:
-    """A given value as a physical number. The 0.99 of a float32 is 0.99, not 0.9900000095, beyond the range's end."""
+    """A given value as a physical number (the index of a level). A float32 is read by its shortest decimal: 0.99 is
+    0.99, not 0.9900000095, which is beyond the end of the range."""
     if parameter.levels:
         return parameter.number(str(value))
     dtype = getattr(value, "dtype", np.dtype(float))
@@ -183,19 +191,20 @@ def _in_its_digits(parameter: Parameter, value: Any) -> float:
 def _restored(
     study: Study, plan: Design, points: np.ndarray, answers: np.ndarray, proposal: np.ndarray | None, seed: int
 ) -> Session:
-    """The session with these data. Copies of read-only arrays are writable until they are made read-only again."""
+    """Session with these data, for copies and pickles; its arrays are made read-only, and its step is created again."""
     _read_only(points, answers, *([] if proposal is None else [proposal]))
     return Session(study, plan, points, answers, proposal, seed, Step(study, plan))
 
 
 def _read_only(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The same arrays, read-only: a state is immutable, and its proposal depends on them."""
+    """Make the arrays read-only in place, since states are immutable, and return them."""
     for array in arrays:
         array.flags.writeable = False
     return arrays
 
 
 def _asked(session) -> np.ndarray:
+    """The proposal (d,) of a session. Raises `InputError` once all trials are answered."""
     if session.proposal is None:
         raise InputError(
             f"Session: all {len(session.answers)} trials of the study are answered; nothing is left to ask."

@@ -1,8 +1,8 @@
-"""The next rendering of an optimisation after some answers, and why it is proposed; nothing is fitted here.
+"""The next rendering of an optimisation after some answers, and its explanation; nothing is fitted here.
 
-Space-filling points without an answer come first, then the highest acquisition; with a warm start all come from the
-map. A rendering in which the device stopped twice is excluded: the candidate farthest from all others replaces it among
-the space-filling points, afterwards the highest UCB that keeps a distance of `APART` from it, as choices from a map do.
+Space-filling points without an answer come first, then the maximum of the acquisition function; with a warm start all
+points come from the map. A rendering in which the device stopped twice is excluded: among the space-filling points, the
+candidate farthest from all others replaces it; afterwards, the highest UCB at least `APART` from it, also with a map.
 """
 
 import dataclasses
@@ -44,7 +44,7 @@ class Answers(NamedTuple):
     renderings.
 
     `points`: the renderings as presented, of which the answers have the `categories` (from 0); `proposed`: the same as
-    proposed, which differ where a program confirms what it could present.
+    proposed, which differ where a stimulus program confirms what it could present.
     """
 
     block: int
@@ -55,7 +55,7 @@ class Answers(NamedTuple):
 
     @classmethod
     def of(cls, state: LiveSession, block: int) -> "Answers":
-        """The answers of a block so far."""
+        """The answers of a block so far, and its excluded renderings."""
         names, answered = state.study.space.names, state.answers(block)
         categories = [state.study.responses.index(t.values["class_a"]) for t in answered if t.values is not None]
         return cls(
@@ -68,7 +68,7 @@ class Answers(NamedTuple):
 
     @classmethod
     def after_pending(cls, state: LiveSession) -> list["Answers"]:
-        """With each answer that the pending trial may get, in the order of the categories."""
+        """For each possible response to the pending trial, lowest first, the answers including it."""
         trial, names = state.pending, state.study.space.names
         assert trial is not None
         now = cls.of(state, trial.block)
@@ -79,14 +79,18 @@ class Answers(NamedTuple):
 
 
 def _points(names: tuple[str, ...], renderings: Iterable[Mapping[str, float]]) -> Points:
+    """Renderings (name -> value) as tuples of numbers in the order of `names`."""
     return tuple(tuple(values[name] for name in names) for values in renderings)
 
 
 def next_point(
     session: Session, warm: WarmStart | None, answers: Answers, fitted: Fitted
 ) -> tuple[Float[np.ndarray, " d"], str]:
-    """The next rendering (d,) in physical units, and what chose it. `session` has study and design, `fitted` the
-    posterior of the answers."""
+    """The next rendering (d,) in physical units, and what chose it, such as "latin hypercube", "map" or the
+    acquisition.
+
+    `session` has study and design; `warm`: a warm start or None; `fitted`: posterior after `answers`, and its point.
+    """
     study, initial = session.study, session.step.initial
     excluded = _rows(study, answers.excluded)
     exhausted = all_excluded(study, excluded)
@@ -107,8 +111,8 @@ def next_point(
 
 
 def unanswered(initial: Float[np.ndarray, "k d"], proposed: Points, excluded: Points) -> list[Float[np.ndarray, " d"]]:
-    """Points of the initial design without an answer, but for the excluded ones; of levels and whole numbers the design
-    may hold one twice."""
+    """Points of the initial design without an answer that are not excluded, in their order; a point that is in the
+    design twice (levels, whole numbers) needs two answers. Physical units."""
     answered, left = Counter(proposed), []
     for point in initial:
         place = tuple(point.tolist())
@@ -120,9 +124,8 @@ def unanswered(initial: Float[np.ndarray, "k d"], proposed: Points, excluded: Po
 
 
 def all_excluded(study: Study, excluded: Float[np.ndarray, "k d"]) -> Float[np.ndarray, " d"] | None:
-    """Where no rendering is `APART` from all excluded ones, since levels and whole numbers have few: the candidate
-    farthest from them; if that is excluded too, the first of them, whose stops are fewest. None elsewhere. Physical
-    units."""
+    """For discrete spaces in which no rendering is at least `APART` from all `excluded` ones: the candidate farthest
+    from them, or the first excluded one, with the fewest stops, if all are excluded. None otherwise. Physical units."""
     if not len(excluded) or not all(study.space.discrete):
         return None
     candidates = study.space.candidates(_SPREAD, 0)
@@ -136,8 +139,9 @@ def all_excluded(study: Study, excluded: Float[np.ndarray, "k d"]) -> Float[np.n
 def spread_point(
     study: Study, excluded: Float[np.ndarray, "k d"], others: Float[np.ndarray, "m d"], seed: int
 ) -> Float[np.ndarray, " d"]:
-    """A space-filling point in place of an excluded one, in physical units: of the candidates that are `APART` from all
-    excluded ones the farthest from all points; where all values have been proposed, one of the least often proposed."""
+    """A space-filling point (d,) in place of an excluded one: among candidates at least `APART` from all `excluded` (if
+    there are any) the farthest from these and the `others`; if all candidates have been proposed, one of the least
+    often proposed. Points in physical units."""
     candidates = study.space.candidates(_SPREAD, seed)
     allowed = np.all(_distances(study, candidates, excluded) >= APART, axis=1)
     if allowed.any():
@@ -150,21 +154,24 @@ def spread_point(
 def _distances(
     study: Study, units: Float[np.ndarray, "c d"], physical: Float[np.ndarray, "k d"]
 ) -> Float[np.ndarray, "c k"]:
-    """Between points of the unit cube and renderings in physical units, in the unit cube."""
+    """Distances in the unit cube between points `units` of the unit cube and points `physical` in physical units."""
     away = differences(study.gp.kernel.levels, units[:, None], _to_unit(study, physical)[None])
     return np.linalg.norm(away, axis=2)
 
 
 def _rows(study: Study, points: Points) -> Float[np.ndarray, "n d"]:
+    """Points as an array, with d columns also if there are none."""
     return np.array(points, float).reshape(-1, study.space.dim)
 
 
 def _to_unit(study: Study, physical: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k d"]:
+    """Points from physical units to the unit cube, as a NumPy array."""
     return np.asarray(study.space.to_unit(physical))
 
 
 def _padded(study: Study, excluded: Float[np.ndarray, "k d"]) -> Float[Array, "r d"]:
-    """Excluded points in the unit cube, behind points far away, so that one more compiles nothing again."""
+    """Excluded points in the unit cube, padded with rows far away to a fixed number, so that another one needs no
+    compilation."""
     rows = np.full((max(_ROOM, len(excluded)), study.space.dim), _FAR)
     if len(excluded):
         rows[-len(excluded) :] = _to_unit(study, excluded)
@@ -173,16 +180,20 @@ def _padded(study: Study, excluded: Float[np.ndarray, "k d"]) -> Float[Array, "r
 
 @program
 def _highest_apart(study, plan, posterior, excluded):
+    """Point (d,) of the highest UCB at least `APART` from the excluded points (r, d), which are in the unit cube; the
+    result is in physical units."""
     return study.space.to_physical(point_away_from(study, plan, posterior, excluded, APART))
 
 
 @program
 def _highest_of_map(study, warm, posterior, excluded):
+    """The same among the candidates of the warm start."""
     return study.space.to_physical(warm_point(study, warm, posterior, excluded, APART))
 
 
 class _Prediction(NamedTuple):
-    """The latent score at a rendering, and the certificate of the fit that predicts it."""
+    """Prediction of the latent score at a rendering, and the certificate (convergence diagnostics) of the fit behind
+    it."""
 
     unit: Float[Array, " d"]
     mean: Float[Array, ""]
@@ -193,6 +204,7 @@ class _Prediction(NamedTuple):
 
 @program
 def _prediction(study: Study, posterior: Posterior, point: Float[Array | np.ndarray, " d"]) -> _Prediction:
+    """Predict the latent score and the category probabilities at a point (d,) in physical units."""
     unit = study.space.to_unit(point)
     mean, variance = (moment[0] for moment in posterior.predict(unit[None, :]))
     probabilities = study.gp.likelihood.class_probabilities(mean, variance)
@@ -200,10 +212,12 @@ def _prediction(study: Study, posterior: Posterior, point: Float[Array | np.ndar
 
 
 def explained(study: Study, posterior: Posterior, point: Float[np.ndarray, " d"], by: str) -> dict[str, Any]:
-    """The data of a proposal of a rendering (d,) in physical units: `renderings`, and `choice`, which has what chose
-    it, mean and sd of the latent score, the acquisition's value, the probabilities of the answers, the passivity margin
-    (N·s/m) and the certificate of the fit. Numbers that are not finite, as those of a failed fit, are left out: JSON
-    has none."""
+    """Data of a proposal of the rendering `point` (d,) in physical units, chosen by `by`: `renderings` and `choice`.
+
+    `choice` explains it: `by`, the point in the unit cube, mean and sd of the latent score, the value of the
+    acquisition (UCB only), category probabilities, passivity margin (N·s/m), and the fit's convergence diagnostics.
+    Numbers that are not finite are left out, since JSON has none.
+    """
     rendering = Rendering.of(study.space, point)
     predicted: _Prediction = jax.device_get(_prediction(study, posterior, np.asarray(point)))
     mean, sd = float(predicted.mean), math.sqrt(predicted.variance) if predicted.variance >= 0 else math.nan
@@ -222,6 +236,6 @@ def explained(study: Study, posterior: Posterior, point: Float[np.ndarray, " d"]
 
 
 def _finite(values: dict[str, Any]) -> dict[str, Any]:
-    """Without the numbers that are not finite."""
+    """Copy without entries that are not finite floats, also in nested dicts; NaN and infinity are removed."""
     kept = {key: _finite(value) if isinstance(value, dict) else value for key, value in values.items()}
     return {key: value for key, value in kept.items() if not isinstance(value, float) or math.isfinite(value)}

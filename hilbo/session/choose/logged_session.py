@@ -1,10 +1,10 @@
-"""Ask and tell with a log: a session from a notebook or a script, by the code of the live one.
+"""Ask and tell with a log: a session in a notebook or a script, by the code of live sessions.
 
     with LoggedSession.open("logs", study, header_for(study.file, "P01", seed=1, warm=False)) as session:
         while (point := session.ask()) is not None:
             session.tell(felt(point))
 
-An existing log of the same header is resumed, to exactly the same next rendering.
+An existing log with the same header is resumed, with exactly the same next rendering.
 """
 
 import os
@@ -25,14 +25,19 @@ __all__ = ["LoggedSession"]
 
 
 class LoggedSession:
-    """An open session; made by `open`. `dropped` says what was cut off a torn log."""
+    """An open session; created by `open`. `dropped`: sentence on an incomplete last line of a resumed log, or ""."""
 
     def __init__(self, log: EventLog, chooser: LiveChooser) -> None:
         self.log, self.chooser, self.dropped = log, chooser, log.dropped
 
     @classmethod
     def open(cls, folder: str | os.PathLike, study: Study, header: Header) -> "LoggedSession":
-        """Begin a session, or go on with the one of this participant and label. Raises InputError."""
+        """Begin a session in `folder`, or resume the one with this participant and label; the log is locked until
+        `close`.
+
+        Raises InputError if the log was begun with another header, is in use or damaged, or another session of the
+        participant is running; a log created by this call is then deleted.
+        """
         path = Path(folder) / log_name(header)
         new = not begun(path)
         if new:
@@ -52,12 +57,12 @@ class LoggedSession:
 
     @property
     def state(self) -> LiveSession:
-        """The session so far."""
+        """The state of the session so far."""
         return self.log.state
 
     def ask(self) -> dict[str, float] | None:
-        """The rendering to present: parameter -> value in physical units; None at the end. Comparisons have two: see
-        `state.pending.renderings`."""
+        """The rendering to present: parameter -> value in physical units; None at the end. Logs the proposal, and
+        passes rests and ends of warm-ups. Comparisons have two renderings: see `state.pending.renderings`."""
         while self.state.screen in ("ready", "rest"):
             self.log.append(live.go_on(self.state, time.time()))
         if self.state.need is not None:
@@ -65,9 +70,10 @@ class LoggedSession:
         return None if self.state.pending is None else self.state.pending.renderings["a"]
 
     def tell(self, response: str, **others: str) -> None:
-        """The answer to it; of a comparison `response` is that about a, `others` are class_b and preferred.
+        """Log the answer to the pending trial; for a comparison `response` is class_a (or preferred, if only that is
+        asked), and `others` are class_b and preferred.
 
-        Raises `InputError` if nothing has been asked.
+        Raises `InputError` if nothing has been asked, and RefusedError for an answer that is not valid.
         """
         trial = self.state.pending
         if trial is None:
@@ -79,7 +85,7 @@ class LoggedSession:
         self.log.append(event)
 
     def close(self) -> None:
-        """Let others write the log."""
+        """Close the log, which ends its lock."""
         self.log.close()
 
     def __enter__(self) -> "LoggedSession":

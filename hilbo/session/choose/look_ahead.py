@@ -1,12 +1,12 @@
-"""Look-ahead of a live session: the next rendering is found before it is needed, so that no fit runs after an answer.
+"""Look-ahead of a live session: the next rendering is computed before it is needed, so that no fit runs after an
+answer.
 
-`LiveChooser.lookahead(state)` finds the next rendering for each answer that may come; `choose` then only looks it up.
-Each answer's posterior is fitted once, by the step that chooses (`hilbo.session.choose.step`), and kept: it explains
-the choice, and the experimenter's page reads it. Optimisation renderings are those of
+`LiveChooser.lookahead(state)` computes the next rendering for each possible answer; `choose` then only looks it up.
+Each answer's posterior is fitted once, by the step that chooses (`hilbo.session.choose.step`), and cached: it explains
+the choice and is shown on the experimenter page. Renderings of an optimisation are those of
 `hilbo.session.choose.ask_tell.Session`, bit for bit: they depend on the study, the seed (of the material:
-`header.material_seed`) and the answers that count. A space-filling point without an answer that counts comes before all
-others. With a warm start (`hilbo.session.choose.warm_start`, one for each material) there are no space-filling trials:
-points come from it.
+`header.material_seed`) and the answers that count. Space-filling points without an answer come first. With a warm start
+(`hilbo.session.choose.warm_start`, one per material) there are none: all points come from its map.
 """
 
 import threading
@@ -63,7 +63,7 @@ class LiveChooser:
         }
 
     def warm(self) -> None:
-        """Compile what proposals need, by choosing the first of each block."""
+        """Compile all programs that proposals need, by choosing the first rendering of each block."""
         for rendering in self._planned.values():
             _ = rendering.margin
         for number in self.chosen_blocks:
@@ -71,11 +71,15 @@ class LiveChooser:
 
     @property
     def chosen_blocks(self) -> list[int]:
-        """The blocks whose renderings are not planned."""
+        """Indices of the blocks whose renderings are chosen, not planned."""
         return [number for number, block in enumerate(self._blocks) if not block.trials]
 
     def choose(self, state: LiveSession, need: Need) -> dict[str, Any]:
-        """The data of a proposal: `renderings`, and `sets`, `first` or `choice`."""
+        """Data of the next proposal: `renderings`, and `sets`, `first` or `choice` (the explanation).
+
+        A repetition has the data of the trial that it repeats, a planned trial its sets; else the choice is looked up,
+        or computed with a fit.
+        """
         block = state.header.blocks[need.block]
         if need.repeats is not None:
             data = state.trial(need.repeats).data
@@ -88,8 +92,11 @@ class LiveChooser:
             return self._choice(answers)
 
     def lookahead(self, state: LiveSession, wanted: Callable[[], bool] = lambda: True) -> dict[str, dict[str, Any]]:
-        """For each answer to the pending optimisation trial, the likely ones first: what would be proposed after it.
-        Empty where that is known without a fit; ends when it is not `wanted` any more."""
+        """Response -> proposal that would follow it, for the pending optimisation trial, most probable response first.
+
+        Computed choices are cached. Empty if no fit is needed: for repetitions, planned trials and the last trial of a
+        block. Stops early once `wanted` returns False.
+        """
         trial = state.pending
         if trial is None or trial.repeats is not None or state.header.blocks[trial.block].trials:
             return {}
@@ -111,7 +118,7 @@ class LiveChooser:
         return self._studies[self._blocks[block].material]
 
     def fitted(self, answers: Answers) -> Fitted:
-        """The posterior after some answers, and the point that it chooses: fitted once while it is kept."""
+        """The posterior after some answers, and the point that it leads to; fitted on the first call, then cached."""
         key = answers.block, answers.points, answers.categories
         with self._lock:
             if key not in self._fitted:
@@ -124,13 +131,15 @@ class LiveChooser:
             return self._fitted[key]
 
     def best(self, block: int, fitted: Fitted) -> Float[np.ndarray, " d"]:
-        """Where the posterior mean is largest, in physical units; nothing is fitted. (d,)."""
+        """Point (d,) with the largest posterior mean, in physical units; nothing is fitted."""
         return self._session(block).step.best(fitted.posterior)
 
     def _session(self, block: int) -> Session:
+        """The `Session` (study, seed, design, step) of a block's material."""
         return self._sessions[self._blocks[block].material]
 
     def _of_plan(self, material: str | None, planned: Planned) -> dict[str, Any]:
+        """Data of the proposal of a planned trial."""
         sides = {"a": planned.a} if planned.b is None else {"a": planned.a, "b": planned.b}
         renderings = {side: self._planned[material, id] for side, id in sides.items()}
         return {
@@ -141,6 +150,7 @@ class LiveChooser:
         }
 
     def _choice(self, answers: Answers) -> dict[str, Any]:
+        """Data of the proposal after these answers, from the cache or computed with a fit."""
         with self._lock:
             if answers not in self._choices:
                 session, fitted = self._session(answers.block), self.fitted(answers)
@@ -151,12 +161,12 @@ class LiveChooser:
 
 
 def warm_start_sources(warm: Mapping[str | None, WarmStart]) -> str | None:
-    """Warm starts of a session as its header holds them, one for each material; None if there are none."""
+    """Text for the header that identifies a session's warm starts, "MATERIAL=SOURCE,…"; None if there are none."""
     return ",".join(f"{name or ''}={warm[name].source}" for name in sorted(warm, key=str)) or None
 
 
 def _from(sources: str | None) -> str:
-    """Warm starts of a header in words."""
+    """Clause for messages: the warm starts that a header's text identifies, such as "without --warm-start"."""
     if sources is None:
         return "without --warm-start"
     maps = [source.rpartition("=")[::2] for source in sources.split(",")]
@@ -165,7 +175,8 @@ def _from(sources: str | None) -> str:
 
 
 def _checked_warm(state: LiveSession, warm: Mapping[str | None, WarmStart]) -> dict[str | None, WarmStart]:
-    """The warm starts, which must be those of the header: the next trial is to be the same after a resume."""
+    """Return the warm starts. Raises InputError if they are not those of the header: after a resume the next trial must
+    be the same."""
     sources = warm_start_sources(warm)
     if sources != state.header.warm_start:
         begun = state.header.warm_start

@@ -1,13 +1,13 @@
-"""Progress of a session for the experimenter, who may stop earlier or go on; nothing stops by itself.
+"""Progress of a session for the experimenter, who may stop earlier or continue; nothing stops by itself.
 
-`trust` looks at the answers of an optimisation through the participant's posterior:
+`trust` describes how well an optimisation has located the participant's best rendering:
 
-- the probability that the current best rendering is answered with the highest category,
-- how far the best rendering is expected to move with one more answer: the mean over the answers that the posterior
-  predicts for the rendering that comes next, of the NRMSE (share of the search ranges) between the bests.
+- the probability that the current best rendering is rated in the highest category,
+- how far the best rendering is expected to move after one more answer: the mean over the predicted answers to the next
+  rendering of the NRMSE (fraction of the search ranges) between the two best renderings.
 
-`consistency` looks at the repeated trials, `hilbo.app.pages.pace` at the clock. The paper's fixed number of trials
-stays the default.
+`consistency` compares repeated trials; `hilbo.app.pages.pace` is about the time. The default stays the paper's fixed
+number of trials.
 """
 
 from collections.abc import Sequence
@@ -54,8 +54,11 @@ def trust(
     upcoming: Float[np.ndarray, " d"] | None,
     following: Sequence[Fitted],
 ) -> Trust:
-    """From the posterior after the answers so far, the rendering (d,) that comes next in physical units, and the
-    posteriors after each answer to it. Nothing is fitted."""
+    """Compute `Trust` from posteriors; nothing is fitted.
+
+    `fitted`: after the answers so far; `upcoming`: the next rendering (d,), physical units, or None; `following`: after
+    each possible answer to it.
+    """
     study = chooser.study(block)
     bests = np.stack([chooser.best(block, one) for one in (fitted, *following)])
     next_one = bests[0] if upcoming is None else upcoming
@@ -69,16 +72,19 @@ def trust(
 
 @program
 def _chances(study, posterior, physical):
+    """Category probabilities (m, C) at points (m, d) in physical units."""
     return posterior.class_probabilities(study.space.to_unit(physical))
 
 
 @program
 def _units(study, physical):
+    """Points from physical units to the unit cube."""
     return study.space.to_unit(physical)
 
 
 def trust_of(state: LiveSession, block: int, chooser: LiveChooser) -> Trust | None:
-    """`trust` in an optimisation block of a session; None before its first answer."""
+    """`trust` for an optimisation block of a session, with fits for each possible answer to the pending trial, from the
+    chooser's cache; None before the first answer."""
     answers, trial = Answers.of(state, block), state.pending
     if not answers.categories:
         return None
@@ -90,7 +96,7 @@ def trust_of(state: LiveSession, block: int, chooser: LiveChooser) -> Trust | No
 
 
 def consistency(state: LiveSession) -> Consistency:
-    """Of the repeated trials of a session against the trials they repeat."""
+    """Compare the answers to repeated trials with those to the trials they repeat, as far as both count."""
     ranks = {label: i for i, label in enumerate(state.study.responses)}
     distances = []
     for trial in state.trials:

@@ -46,7 +46,7 @@ class Choosing(eqx.Module):
 
     @classmethod
     def of(cls, study: Study) -> "Choosing":
-        """Without the numbers of the selection that are no part of a program."""
+        """Part of a study that choices depend on; numbers that are no part of a program are set to 0."""
         selection = msgspec.structs.replace(study.file.selection, space_filling=0, weight=0.0)
         return cls(study.gp, study.space, study.inference, selection)
 
@@ -55,7 +55,7 @@ class Design(eqx.Module):
     """Seeded part of a session: the first points (s, d), and the points among which the acquisition is maximised.
 
     The latter are a lattice in two or three dimensions, whose nodes are products and cost a hundredth of other points;
-    else, for constraints, whole numbers and levels, and for Thompson's draws, `candidates`.
+    else, for constraints, whole numbers and levels, and for Thompson's draws, `candidates`. Unit cube.
     """
 
     initial: Float[Array, "s d"]
@@ -65,7 +65,8 @@ class Design(eqx.Module):
 
 
 def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
-    """The seeded part of a session: space-filling points (s, d), and the points to search, in the unit cube."""
+    """Create the seeded part of a session: space-filling points (s, d), and the points to search, in the unit cube.
+    `count`: number of candidates, if no lattice is used."""
     space, nodes = study.space, nodes_for(float(np.asarray(study.gp.kernel.theta).max()))
     on_lattice = space.even and space.dim in (2, 3) and study.file.selection.acquisition != "thompson"
     return Design(
@@ -79,9 +80,10 @@ def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
 def next_point(
     study: Study, plan: Design, trials: Trials, trial: Int[Array, ""] | int, weight: ArrayLike | None = None
 ) -> Float[Array, " d"]:
-    """The point (d,) of the unit cube to ask after the given answers, by the study's acquisition; traceable.
+    """Fit the given answers, and return the next point (d,) of the unit cube by the study's acquisition; traceable.
 
-    `weight`: of the standard deviation in UCB, if it is not to be the study's.
+    `trial`: index of the trial, which seeds Thompson's draw. `weight`: of the standard deviation in UCB, None for the
+    study's. Never a space-filling point.
     """
     posterior = fit(study.gp, trials, inference=study.inference, throw=False)
     weight = study.file.selection.weight if weight is None else weight
@@ -91,7 +93,8 @@ def next_point(
 def point_after(
     choosing: Choosing, plan: Design, posterior: Posterior, trial: Int[Array, ""] | int, weight: ArrayLike
 ) -> Float[Array, " d"]:
-    """The same from the posterior of the answers; `weight`: of the standard deviation in UCB."""
+    """The next point (d,) of the unit cube, by the acquisition, from the posterior of the answers; arguments as in
+    `next_point`."""
     thompson, distance = choosing.selection.acquisition == "thompson", choosing.selection.minimum_distance
     allowed = None
     if distance:
@@ -105,9 +108,11 @@ def point_after(
 def point_away_from(
     study: Study, plan: Design, posterior: Posterior, excluded: Float[Array, "k d"], distance: float
 ) -> Float[Array, " d"]:
-    """The highest UCB (d,) at least `distance` from the points `excluded`, all in the unit cube; traceable."""
+    """Point (d,) with the highest UCB at least `distance` from the points `excluded`, all in the unit cube;
+    traceable."""
 
     def allowed(x):
+        """Whether the point x (d,) keeps the distance."""
         return jnp.all(jnp.sum(differences(study.gp.kernel.levels, excluded, x[None, :]) ** 2, axis=1) >= distance**2)
 
     return _highest(Choosing.of(study), plan, posterior, acquisition.UCB(study.file.selection.weight), allowed).x
@@ -116,9 +121,11 @@ def point_away_from(
 def _highest(
     choosing: Choosing, plan: Design, posterior: Posterior, score: OptimisticScore, allowed: Callable | None = None
 ) -> Choice:
-    """Where a score is largest in the feasible set; screened in float32."""
+    """Maximise a score over the feasible set: screening in float32 on the design's points, then polishing. `allowed`:
+    further condition on a point (d,), or None."""
 
     def score_at(x):
+        """Score at the point x (d,)."""
         mean, variance = posterior.predict(x[None, :])
         return score(mean[0], variance[0])
 
@@ -142,6 +149,7 @@ def _highest(
 
 
 def _score(choosing: Choosing, posterior: Posterior, weight: ArrayLike) -> OptimisticScore:
+    """The study's acquisition as a function of mean and variance; `weight`: of the standard deviation, for UCB only."""
     kind = choosing.selection.acquisition
     if kind == "ucb":
         return acquisition.UCB(weight)
@@ -152,7 +160,8 @@ def _score(choosing: Choosing, posterior: Posterior, weight: ArrayLike) -> Optim
 
 
 def _searched(plan: Design, count: int | None) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:
-    """The points (m, d) that are searched, the first `count` of candidates; and which of them are feasible."""
+    """The points (m, d) that are searched, of candidates only the first `count` (None: all), and which of them are
+    feasible."""
     if plan.lattice is not None:
         return plan.lattice.everywhere()
     assert plan.candidates is not None
@@ -167,8 +176,8 @@ def _keeps_distance(
     usable: Bool[Array, " m"],
     distance: float,
 ) -> Callable[[Float[Array, " d"]], Bool[Array, ""]]:
-    """Whether a point keeps the distance to every earlier trial; where none of the usable points does, whether it is as
-    far from all trials as one of them can be."""
+    """Return a function that tests whether a point keeps the distance to every earlier trial. If no usable point does,
+    it accepts the points that are as far from all trials as the farthest of them."""
 
     def gap(x: Float[Array, " d"]) -> Float[Array, ""]:
         """Squared distance to the nearest trial."""
@@ -187,7 +196,8 @@ def _thompson_point(
     trial: Int[Array, ""] | int,
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None,
 ) -> Float[Array, " d"]:
-    """Where one joint draw of the function is largest among the candidates that are allowed."""
+    """Point (d,) at which a joint posterior draw is largest, among the candidates that are allowed (None: all). The
+    draw is seeded by the design's key and `trial`."""
     assert plan.candidates is not None
     points = plan.candidates[:_JOINT_CANDIDATES]
     cross = gram(posterior.gp.kernel, points, posterior.trials.x)

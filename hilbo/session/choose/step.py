@@ -1,11 +1,11 @@
-"""The compiled step of a session: from answers to their posterior and the next point, by one fit.
+"""The compiled step of a session: from answers to their posterior and the next point, in one fit.
 
-Sessions and live sessions run this very program, so that they ask the same points bit for bit. It takes a posterior
-that is known already in place of answers, and then only searches: the largest posterior mean needs no second fit.
+`Session` and live sessions run this same program, so that they ask the same points bit for bit. A known posterior can
+be given in place of answers; the program then only searches, so that the largest posterior mean needs no second fit.
 
-Numbers go in and come out as one vector each, because an array costs more on its way than the numbers in it. The part
-of Laplace's certificate that nobody reads before a choice is explained, 5 % of a step, is made from the fit's numbers
-when the posterior is asked for.
+Numbers go in and come out as one vector each, because the transfer of an array costs more than its numbers. The part of
+Laplace's certificate (convergence diagnostics) that is not needed to choose a point, 5 % of a step, is computed from
+the fit's numbers when the posterior is requested.
 """
 
 import dataclasses
@@ -35,14 +35,14 @@ _MADE_LATER = ("smallest_variance", "evidence_error", "evidence_rounding", "conv
 
 
 class Fitted(NamedTuple):
-    """Answers, fitted: the point (d,) that they choose, physical units, and the posterior that chose it."""
+    """Result of a fit: the next point (d,) that the answers lead to, in physical units, and their posterior."""
 
     point: Float[np.ndarray, " d"]
     posterior: Posterior
 
 
 def padding(study: Study, capacity: int) -> Float[np.ndarray, "capacity d"]:
-    """What stands in rows without an answer, in physical units: the middle of the box."""
+    """Values for rows without an answer: the middle of the parameters' ranges, in physical units."""
     return np.tile([p.middle for p in study.space.parameters], (capacity, 1))
 
 
@@ -68,11 +68,13 @@ class Step:
 
     @property
     def compiled(self) -> Any:
-        """The program behind it; where none are kept, shared by all studies that differ in numbers only."""
+        """The compiled program of the step; unless programs are kept on disk, studies that differ only in numbers share
+        it."""
         return self._bound.program
 
     def __call__(self, points: Float[np.ndarray, "n d"], answers: Any) -> Float[np.ndarray, " d"] | None:
-        """The next point, as numbers that survive a round trip through text; None when all trials are answered."""
+        """Next point (d,) in physical units after the answers: a space-filling one, else by a fit; None once all trials
+        of the study are answered. `points`: renderings; `answers`: their categories (n,), from 0."""
         count = len(answers)
         if count >= self.capacity:
             return None
@@ -81,7 +83,8 @@ class Step:
         return self._physical(self._run(points, answers)[: len(self.names)])
 
     def fitted(self, points: Float[np.ndarray, "n d"], answers: Any) -> Fitted:
-        """The posterior after any number of answers, and the point that it chooses; by the same call."""
+        """Posterior after any number of answers up to the capacity, and the point that it leads to; one fit, never a
+        space-filling point."""
         numbers = self._run(points, answers)
         dim = len(self.names)
         posterior = Posterior(self._study.gp, *jax.device_put(self._layout.tree(numbers[dim:])))
@@ -89,25 +92,26 @@ class Step:
         return Fitted(point, _certified(posterior) if self._study.inference == "laplace" else posterior)
 
     def best(self, posterior: Posterior) -> Float[np.ndarray, " d"]:
-        """Where the mean of a posterior of this study is largest, in physical units; nothing is fitted."""
+        """Point (d,) with the largest mean of a posterior of this study, in physical units; nothing is fitted."""
         query = self._blank.copy()
         query[_GIVEN] = 1.0
         packed = jax.device_put(self._layout.vector(posterior))
         return self._physical(self._bound_to_the_mean(query, packed)[: len(self.names)])
 
     def _physical(self, points: Any) -> Float[np.ndarray, "*n d"]:
-        """Points (..., d) of a program as float64, which tables and devices have, within the parameters' ranges: where
-        JAX computes with 32 bits, its number for an end may be beyond that end. Read-only."""
+        """Points (..., d) from a program as read-only float64, limited to the parameters' ranges: where JAX computes
+        with 32 bits, its number for an end may be beyond that end."""
         numbers = np.asarray(points).astype(np.float64)
         numbers = np.where(numbers < self._low, self._low, np.where(numbers > self._high, self._high, numbers))
         numbers.flags.writeable = False
         return numbers
 
     def warm(self) -> None:
-        """Compile the step."""
+        """Compile the step, by running it without answers."""
         self._run(np.zeros((0, len(self.names))), ())
 
     def _run(self, points, answers) -> Float[np.ndarray, " k"]:
+        """Run the program on the answers; return the next point and, after it, the numbers of the posterior."""
         query, count = self._blank.copy(), len(answers)
         query[_COUNT], query[_WEIGHT] = count, self.weight
         query[_FACTS : _FACTS + count] = answers
@@ -117,39 +121,46 @@ class Step:
 
     @functools.cached_property
     def _layout(self) -> "_Layout":
+        """Layout of a posterior's numbers in a vector; computed once."""
         return _Layout(_posterior_shapes(self._choosing))
 
     @functools.cached_property
     def _none_given(self) -> Float[Array, " p"]:
+        """Placeholder (zeros) where no posterior is given."""
         return jax.device_put(np.zeros(self._layout.size))
 
     @functools.cached_property
     def _bound(self) -> "_Bound":
+        """The program of this study, with its arrays; compiled at its first use."""
         return self._bound_by(self._choosing)
 
     @functools.cached_property
     def _bound_to_the_mean(self) -> "_Bound":
-        """The UCB of weight 0 is largest where the mean is: in most studies this is the program that chooses."""
+        """The program that maximises the posterior mean: UCB with weight 0, in most studies the same program as
+        `_bound`."""
         plain = msgspec.structs.replace(self._choosing.selection, acquisition="ucb", minimum_distance=None)
         return self._bound_by(dataclasses.replace(self._choosing, selection=plain))
 
     def _bound_by(self, choosing: Choosing) -> "_Bound":
+        """Prepare the program for these settings, with its arrays."""
         arrays = arrays_in((choosing, self._plan))
         return _Bound(prepared(_step, choosing, self._plan, self._blank, self._none_given), arrays)
 
 
 class _Bound(NamedTuple):
-    """The program of a step, and its arrays but for what is asked."""
+    """A step's program and its constant arrays, called with the two arrays that change."""
 
     program: OfArrays
     arrays: tuple[Array, ...]
 
     def __call__(self, query: Float[np.ndarray, " k"], packed: Float[Array, " p"]) -> Float[Array, " r"]:
+        """Run the program on a query, and on a posterior's numbers (used only if the query says so)."""
         return self.program((*self.arrays, query, packed))
 
 
 class _Query(NamedTuple):
-    """Input of a step: number of answers, weight of the sd, whether a posterior is given, categories and points."""
+    """Input of a step: number of answers, weight of the sd in UCB, whether a posterior is given, categories and points
+    (physical units)."""
 
     count: Int[Array, ""]
     weight: Float[Array, ""]
@@ -159,6 +170,7 @@ class _Query(NamedTuple):
 
     @classmethod
     def of(cls, numbers: Float[Array, " k"], capacity: int) -> "_Query":
+        """Split the input vector into its parts."""
         first = _FACTS + capacity
         return cls(
             numbers[_COUNT].astype(jnp.int32),
@@ -170,20 +182,21 @@ class _Query(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """How a posterior's trials and latent values, of these `shapes`, lie in a vector."""
+    """Order of a posterior's trials and latent values, of these `shapes`, in a vector."""
 
     shapes: Any
 
     @property
     def size(self) -> int:
+        """Length of the vector."""
         return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(self.shapes))
 
     def vector(self, posterior: Posterior) -> Float[np.ndarray, " p"]:
-        """A posterior's numbers, on the host."""
+        """Pack a posterior's trials and latent values into a vector of NumPy."""
         return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves((posterior.trials, posterior.latent))])
 
     def tree(self, vector: Any) -> Any:
-        """Trials and latent values from a vector (p,) of NumPy or JAX."""
+        """Unpack trials and latent values from a vector (p,) of NumPy or JAX; the inverse of `vector`."""
         leaves, structure = jax.tree.flatten(self.shapes)
         ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])
         parts = [
@@ -196,7 +209,10 @@ class _Layout(NamedTuple):
 def _step(
     choosing: Choosing, plan: Design, numbers: Float[Array, " k"], packed: Float[Array, " p"]
 ) -> Float[Array, " r"]:
-    """The next point in physical units and, behind it, the posterior's numbers."""
+    """The traced step: fit the answers in `numbers`, or take the posterior in `packed`, and choose the next point.
+
+    Returns the point in physical units and, after it, the posterior's numbers.
+    """
     query = _Query.of(numbers, choosing.selection.trials)
     layout = _Layout(_shapes(choosing))
     trials, latent = jax.lax.cond(query.given, lambda: layout.tree(packed), lambda: _fitted(choosing, query))
@@ -207,12 +223,13 @@ def _step(
 
 @program
 def _posterior_shapes(choosing: Choosing) -> Any:
-    """Shapes of trials and latent values as a step returns them. A program, though it computes nothing, so that kept
-    programs make tracing a fit unnecessary."""
+    """Shapes of trials and latent values as a step returns them; nothing is computed. It is a program so that a cached
+    one makes tracing a fit unnecessary."""
     return _shapes(choosing)
 
 
 def _shapes(choosing: Choosing) -> Any:
+    """Shapes and dtypes of the trials and latent values of a fit, by tracing it."""
     capacity = choosing.selection.trials
     numbers = jax.ShapeDtypeStruct((_FACTS + capacity * (1 + choosing.space.dim),), jnp.result_type(float))
     shapes = jax.eval_shape(lambda given: _fitted(choosing, _Query.of(given, capacity)), numbers)
@@ -221,7 +238,7 @@ def _shapes(choosing: Choosing) -> Any:
 
 @traced_once
 def _fitted(choosing: Choosing, query: _Query):
-    """Trials and latent values."""
+    """Fit the answers in the query; return its trials and latent values. For Laplace the certificate is incomplete."""
     mask = jnp.arange(len(query.categories), dtype=query.count.dtype) < query.count
     trials = Trials(choosing.space.to_unit(query.points), query.categories, mask)
     posterior = fit(choosing.gp, trials, inference=choosing.inference, throw=False)
@@ -230,7 +247,8 @@ def _fitted(choosing: Choosing, query: _Query):
 
 
 def _uncertified(latent: Any) -> GaussianPosterior:
-    """Without what `_certified` makes again, which is then not compiled."""
+    """Replace the parts of the certificate that `_certified` computes by zeros, so that they are not compiled into the
+    step."""
     certificate = latent.certificate
     nothing = {name: jnp.zeros_like(getattr(certificate, name)) for name in _MADE_LATER}
     return dataclasses.replace(latent, certificate=dataclasses.replace(certificate, **nothing))
@@ -238,7 +256,7 @@ def _uncertified(latent: Any) -> GaussianPosterior:
 
 @program
 def _certified(posterior: Posterior) -> Posterior:
-    """With the certificate that the fit would have given it."""
+    """Copy of a Laplace posterior with its complete certificate, computed from the fit's numbers."""
     trials, latent, likelihood = posterior.trials, posterior.latent, posterior.gp.likelihood
     terms = OrdinalTerms(likelihood, trials.q, trials.mask)
     certificate = certify(
@@ -256,4 +274,5 @@ def _certified(posterior: Posterior) -> Posterior:
 
 @program
 def _to_physical(space, unit):
+    """Points of the unit cube in physical units."""
     return space.to_physical(unit)

@@ -37,7 +37,7 @@ SHARE = 0.5
 
 
 class WarmStart(eqx.Module):
-    """Candidates (m, d) of the unit cube, and what the map says there before the first answer: m0 and v0, (m,)."""
+    """Candidates (m, d) of the unit cube, and the map's prediction there before the first answer: m0 and v0, (m,)."""
 
     points: Float[Array, "m d"]
     mean: Float[Array, " m"]
@@ -54,13 +54,18 @@ def warm_start(
     source: str = "",
     share: float = SHARE,
 ) -> WarmStart:
-    """From the map's mean and variance at candidates of the unit cube. `points` (m, d), `mean` and `variance` (m,)."""
+    """Create a warm start from the map's latent mean and variance, (m,), at candidates `points` (m, d) of the unit
+    cube.
+
+    `share`: p of the module; the individual variance (1 - p) k is added. `source`: name of the map.
+    """
     prior = float(study.gp.kernel.diagonal(points[0]))
     return WarmStart(points, mean, variance + (1.0 - share) * prior, source)
 
 
 def informed(study: Study, warm: WarmStart, posterior: Posterior) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """mu and s (m,) at the candidates after a participant's answers; see the module."""
+    """Mean mu and variance s (m,) at the candidates after a participant's answers, whose posterior under the study's
+    prior is `posterior`; formulas in the module."""
     mean, explained = posterior.predict_explained(warm.points)
     prior = study.gp.kernel.diagonal(warm.points[0])
     gained = explained / (prior * (prior - explained))
@@ -75,7 +80,8 @@ def warm_point(
     excluded: Float[Array, "k d"] | None = None,
     distance: float = 0.0,
 ) -> Float[Array, " d"]:
-    """The candidate (d,) to ask after a participant's answers, `distance` or farther from the `excluded`; traceable."""
+    """The candidate (d,) with the highest UCB after a participant's answers, at least `distance` from the points
+    `excluded` (k, d; None: no condition), all in the unit cube; traceable. If none is that far, the first candidate."""
     mean, variance = informed(study, warm, posterior)
     score = mean + study.file.selection.weight * jnp.sqrt(variance)
     if excluded is not None:
@@ -86,8 +92,8 @@ def warm_point(
 
 
 def read_warm_start(path: str | os.PathLike, study: Study, seed: int = 0, share: float = SHARE) -> WarmStart:
-    """From the map.nc of a results folder: at its points, or from its grid, interpolated linearly. Raises InputError if
-    it is of other parameters, or damaged."""
+    """Read a warm start from the map.nc of a results folder: at its points, or interpolated linearly from its grid at
+    points that are seeded by `seed`. Raises InputError for a map of other parameters, or a damaged file."""
     from scipy.interpolate import RegularGridInterpolator
 
     from hilbo.study.results.map_netcdf import on_grid, read_map

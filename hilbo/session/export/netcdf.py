@@ -16,10 +16,13 @@ __all__ = ["netcdf"]
 
 
 def netcdf(sessions: Sequence[LiveSession], path: Path, study: StudyFile) -> bool:
-    """The answers to single renderings that are fitted, without warm-up, repeats and excluded flags, as groups of a
-    netCDF file: observed_data has the categories and constant_data what they are about, along `obs_id`, levels by
-    their names; attributes name the study. xarray reads it as a DataTree, ArviZ as InferenceData. False, and no
-    file, where there are none."""
+    """Write the answers that are fitted (single renderings, without warm-up, repetitions, voided trials and excluded
+    flags) as a netCDF file, for xarray (DataTree) and ArviZ (InferenceData). Return False, and write nothing, if there
+    are none.
+
+    Groups, along `obs_id`: observed_data has `category` (from 0), constant_data participant, session, trial and
+    parameters, levels by their names. Attributes name the study.
+    """
     table = trials_table(sessions)
     if len(table):
         excluded = flagged(table, study.exclude_flags)

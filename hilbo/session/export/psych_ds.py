@@ -1,5 +1,5 @@
-"""The tables of sessions as a Psych-DS data set: a folder of CSV files, each with a sidecar that says what its columns
-are."""
+"""The tables of sessions as a Psych-DS data set: a folder of CSV files, each with a JSON sidecar that describes its
+columns."""
 
 import json
 import re
@@ -29,8 +29,11 @@ _TABLES = {
 
 
 def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: StudyFile) -> list[Path]:
-    """Tables with their sidecars and dataset_description.json; the files. Raises InputError for an id, label or name of
-    a set that a spreadsheet would run."""
+    """Write the tables that are not empty, with sidecars, into `folder`/data, and `folder`/dataset_description.json;
+    return the paths of all files written.
+
+    Raises InputError for an id, a label or the name of a set that a spreadsheet would run as a formula.
+    """
     for state in sessions:
         _check_names(state)
     tables = {kind: make(sessions) for kind, make in _TABLES.items()}
@@ -50,7 +53,7 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: StudyFile) ->
 
 
 def _write(table: pd.DataFrame, variables: list[dict[str, str]], data: Path, kind: str, study: StudyFile) -> list[Path]:
-    """A table and its sidecar."""
+    """Write a table and its sidecar, which has the description of its columns (`variables`); return both paths."""
     name = re.sub(r"[^A-Za-z0-9]", "", study.name) or "study"
     path = data / f"study-{name}_table-{kind}_data.csv"
     write_trials(table, path)
@@ -61,6 +64,7 @@ def _write(table: pd.DataFrame, variables: list[dict[str, str]], data: Path, kin
 
 
 def _description(study: StudyFile, logs: int, variables: list[dict[str, str]]) -> dict[str, Any]:
+    """Content of dataset_description.json. `logs`: number of sessions; `variables`: descriptions of all columns."""
     return {
         "@context": "https://schema.org/",
         "@type": "Dataset",
@@ -72,7 +76,8 @@ def _description(study: StudyFile, logs: int, variables: list[dict[str, str]]) -
 
 
 def _check_names(state: LiveSession) -> None:
-    """Names cannot be left out as words can: without them a table does not say whose its rows are."""
+    """Raise InputError for an id, a label or the name of a set that a spreadsheet would run as a formula. Unlike free
+    texts, names cannot be left out of a table, since they identify its rows."""
     header, place = state.header, log_name(state.header)
     check_text(header.participant, "participant", place)
     check_text(header.session, "the session's label", place)
@@ -81,9 +86,11 @@ def _check_names(state: LiveSession) -> None:
 
 
 def _variable(column: str, unit: str, meaning: str) -> dict[str, str]:
+    """Psych-DS description of a column; without `unitText` if `unit` is empty."""
     variable = {"@type": "PropertyValue", "name": column, "description": meaning}
     return variable | {"unitText": unit} if unit else variable
 
 
 def _json(content: Any) -> str:
+    """Format as indented JSON with a final newline."""
     return json.dumps(content, indent=2, ensure_ascii=False) + "\n"

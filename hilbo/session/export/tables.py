@@ -1,9 +1,9 @@
-"""Session logs as tables, made from the logs alone.
+"""Session logs as tables, made from the logs only.
 
-`trials_table` is a trial table (every answer to one rendering; voided and undone ones marked so), `validation_table`
-and `sets_table` are those of `hilbo.study.tables.validation` (voided comparisons left out), `presentations_table` has
-every trial that was ever proposed, and what became of it, `sessions_table` the plan that each session was held by.
-`log_cells` are the cells of `trials_table` as text, which are checked as those of a file are; both give the same bits.
+`trials_table` is a trial table (every answer to a single rendering, voided and undone ones marked), `validation_table`
+and `sets_table` are those of `hilbo.study.tables.validation` (without voided comparisons), `presentations_table` has
+every proposed trial and its outcome, `sessions_table` each session and its plan. `log_cells` are the cells of
+`trials_table` as text, checked like those of a file; both give the same bits.
 """
 
 import os
@@ -45,7 +45,8 @@ _SINGLE = ("warm-up", "optimisation", "repeat")
 def read_sessions(
     folder: str | os.PathLike, study: StudyFile, note: Callable[[str], object] = lambda sentence: None
 ) -> list[LiveSession]:
-    """Every session in a folder but dry runs; `note` is told of those, and of logs that are cut off.
+    """Read every session in a folder except dry runs, every event checked. `note` is called with sentences on dry runs,
+    and on logs that are incomplete or left out.
 
     Raises InputError if there is none, a log is damaged or of another study, or two are of one session.
     """
@@ -68,7 +69,7 @@ def read_sessions(
 
 
 def _check_once(sessions: Mapping[Path, LiveSession]) -> None:
-    """Refuse two logs of one session, such as a copy beside its original: their answers would count twice."""
+    """Raise InputError for two logs of one session, such as a copy next to its original: answers would count twice."""
     first: dict[tuple[str, str], Path] = {}
     for path, state in sessions.items():
         header = state.header
@@ -81,7 +82,8 @@ def _check_once(sessions: Mapping[Path, LiveSession]) -> None:
 
 
 def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """Every answer to a single rendering, one row each, numbers as they were chosen."""
+    """Table of all answers to single renderings, one row each, also warm-up, repetitions, voided and undone ones
+    (`voided` 1)."""
     rows = []
     for state in sessions:
         for trial in state.trials:
@@ -99,8 +101,8 @@ def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
 
 
 def validation_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """Every comparison that counts. Where a program presents, with what it confirmed of either side, which may be off
-    from the sets that were planned."""
+    """Table of all comparisons that count, one row each; with a stimulus program also the values that it confirmed,
+    which may differ from the planned sets."""
     rows = []
     for state in sessions:
         for trial in state.trials:
@@ -123,7 +125,7 @@ def validation_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
 
 
 def _confirmed(study: StudyFile, trial: Trial) -> dict[str, float | str]:
-    """What was presented on either side, in columns that no parameter's own name can be; {} where a device renders."""
+    """Columns with the values presented on either side, under names that no parameter has; {} if a device renders."""
     if study.stimulus is None:
         return {}
     shown = {side: in_words(study, values) for side, values in trial.presented.items()}
@@ -131,7 +133,8 @@ def _confirmed(study: StudyFile, trial: Trial) -> dict[str, float | str]:
 
 
 def sets_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """The compared parameter sets, as they were planned. Raises InputError if one name stands for two sets."""
+    """Table of the planned sets of comparisons, one row each. Raises InputError if two sets have the same name. With
+    mechanics it loads JAX, to compute K0."""
     rows: dict[str, dict[str, Any]] = {}
     for state in sessions:
         for block in state.header.blocks:
@@ -150,13 +153,13 @@ def sets_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
 
 
 def computes_sets(sessions: Sequence[LiveSession]) -> bool:
-    """Whether `sets_table` has to compute, with JAX: the K0 of sets that were compared."""
+    """Whether `sets_table` has to load JAX: to compute the K0 of sets that are compared."""
     compared = any(p.b is not None for state in sessions for block in state.header.blocks for p in block.trials)
     return compared and any(state.study.space.mechanics is not None for state in sessions)
 
 
 def _parameters(box, values: Mapping[str, float]) -> dict[str, Any]:
-    """A set's parameters, with the K0 of one that is rendered."""
+    """Columns of a set's parameters, levels by name; with mechanics also its K0, for which JAX is loaded."""
     if box.mechanics is None:
         return {p.name: p.shown(values[p.name]) if p.levels else float(values[p.name]) for p in box.parameters}
     from hilbo.search.rendering import Rendering
@@ -166,7 +169,7 @@ def _parameters(box, values: Mapping[str, float]) -> dict[str, Any]:
 
 
 def _rendered(mechanics) -> dict[str, Any]:
-    """How all sets of a study are rendered; `states` only where there are any."""
+    """Columns N, T and memory of the study's mechanics, and `states` for full memory; {} without mechanics."""
     if mechanics is None:
         return {}
     facts = {"N": mechanics.N, "T": float(mechanics.T), "memory": mechanics.memory}
@@ -174,7 +177,7 @@ def _rendered(mechanics) -> dict[str, Any]:
 
 
 def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """Every trial that was proposed, and what became of it."""
+    """Table of all proposed trials, one row each, with status, number of presentations, and why it was voided."""
     rows = []
     for state in sessions:
         for trial in state.trials:
@@ -188,8 +191,8 @@ def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
 
 
 def sessions_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """Every session, with the hash of the plan that it was held by (empty where it was held by none), and its
-    pauses."""
+    """Table of sessions, one row each: phases, hash of the plan (empty without a plan), seed, and number and longest
+    (s) of the pauses."""
     rows = []
     for state in sessions:
         header = state.header
@@ -204,8 +207,10 @@ def sessions_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
 def log_cells(
     folder: str | os.PathLike, study: StudyFile, note: Callable[[str], object] = lambda sentence: None
 ) -> list[pd.DataFrame]:
-    """The cells of the trial table of a folder of session logs, as text and in one piece; `study` is the whole one, of
-    all materials."""
+    """The trial table of a folder of session logs as one frame of text cells, in a list. `study` has all materials.
+
+    `note` as in `read_sessions`. Raises InputError, also if there are no answers.
+    """
     table = trials_table(read_sessions(folder, study, note))
     if table.empty:
         raise InputError(f"{folder}: its sessions hold no answers yet; nothing can be aggregated.")
@@ -219,16 +224,19 @@ def read_log_trials(
     *,
     note: Callable[[str], object] = lambda sentence: None,
 ) -> TrialTable:
-    """The trial table of a folder of session logs; `study` is the whole one, of all materials. See `trial_table`."""
+    """The trial table of a folder of session logs, of one `material` if it is given. `study` has all materials. Raises
+    InputError as `read_sessions` and `trial_table` do; `note` is called with their notes."""
     chosen = study.material(material) if material and study.materials else study
     return trial_table(log_cells(folder, study, note), chosen, material, source=str(folder), note=note)
 
 
 def _written(text: Any) -> Any:
+    """Return the value, or `UNWRITTEN` in place of a text that a spreadsheet would run as a formula."""
     return UNWRITTEN if isinstance(text, str) and runs_in_a_spreadsheet(text) else text
 
 
 def _place(state, trial: Trial):
+    """Columns that identify a trial: participant, session, phase, material and trial number."""
     data, header = trial.data, state.header
     return {
         "participant": header.participant,
@@ -240,6 +248,7 @@ def _place(state, trial: Trial):
 
 
 def _times(trial: Trial):
+    """Columns `response_time` (s) and `answered_at` (s since the epoch); None where they are not known."""
     answered = trial.answered or {}
     return {
         "response_time": answered.get("browser", {}).get("response_s"),
@@ -248,14 +257,14 @@ def _times(trial: Trial):
 
 
 def _telemetry(trial: Trial) -> dict[str, Any]:
-    """The flags of a trial that was felt on a device, and the samples that were recorded with it."""
+    """Columns with the telemetry flags of a trial (as text) and its number of samples; None if none were recorded."""
     counts = trial.telemetry
     flags = None if counts is None else flag_words(name for name in counts if name != SAMPLES)
     return {COLUMN: flags, COLUMN_OF_SAMPLES: None if counts is None else counts[SAMPLES]}
 
 
 def _table(rows):
-    """Without columns that say nothing."""
+    """Data frame of the rows, without optional columns that have no values."""
     table = pd.DataFrame(rows)
     if COLUMN_OF_SAMPLES in table:
         table[COLUMN_OF_SAMPLES] = table[COLUMN_OF_SAMPLES].astype("Int64")  # whole numbers, also where some lack

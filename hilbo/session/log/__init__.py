@@ -1,4 +1,5 @@
-"""The log of a session: its events, the state as their fold, and the file to which each is synced before its answer.
+"""The log of a session: its events, the state computed from them, and the file to which each event is synced before it
+is acknowledged.
 
 Loads no JAX.
 """

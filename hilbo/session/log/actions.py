@@ -1,10 +1,11 @@
-"""A live session: what may be done in a state, each as the event that says so.
+"""Actions in a live session: each function checks one in the current state, and returns the event to be logged.
 
     state = LiveSession.start(study, header)
-    event = propose(state, chooser, at)        # or answer, undo, void, ...: what shall be logged, or RefusedError
+    event = propose(state, chooser, at)        # or answer, undo, void, ...; or RefusedError
     state = state.after(event)                 # once it is on disk
 
-Pure: `at` is the time in s since the epoch. `hilbo.session.log.state` says what an event does.
+The functions change nothing; `at` is the time in s since the epoch. All raise `RefusedError` for an action that is not
+possible in the state, and for a time that is not finite. `hilbo.session.log.transitions` applies the events.
 """
 
 import math
@@ -45,10 +46,11 @@ __all__ = [
 
 @runtime_checkable
 class Chooser(Protocol):
-    """What finds renderings: `hilbo.session.choose.look_ahead.LiveChooser`."""
+    """Selects renderings: see `hilbo.session.choose.look_ahead.LiveChooser`."""
 
     def choose(self, state: "LiveSession", need: Need) -> dict[str, Any]:
-        """`renderings`, `sets`, `first` and whatever explains them, for a proposal's data."""
+        """Return part of a proposal's data: `renderings`, and where they apply `sets`, `first` and `choice` (the
+        explanation)."""
         ...
 
 
@@ -56,7 +58,8 @@ class Chooser(Protocol):
 
 
 def propose(state: LiveSession, chooser: Chooser, at: float) -> Event:
-    """The next trial: its renderings, and why these. Raises InputError for a rendering that is no finite number."""
+    """Event for the next trial, with the renderings that `chooser` selects. Raises RefusedError if nothing is to be
+    proposed, InputError for a rendering that is not finite."""
     if state.need is None:
         raise RefusedError("nothing", f"nothing is to be proposed now: the screen shows {state.screen}.")
     need = state.need
@@ -79,8 +82,9 @@ def propose(state: LiveSession, chooser: Chooser, at: float) -> Event:
 
 
 def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event:
-    """A rendering is in force, as a device says (`facts`: its CRC, what it read back, times), or as the program that
-    presents it does (`values`: parameter -> physical unit). Raises RefusedError for values that are too far off."""
+    """Event: a rendering is in force. `facts`: what a device reports (CRC, values read back, times), or `values`, those
+    that a stimulus program confirms. Raises RefusedError for a trial that is not pending, and for values beyond the
+    tolerance."""
     pending = _live(state, trial)
     if side not in pending.renderings:
         raise RefusedError("bad-answer", f'trial {trial} has no side "{side}".')
@@ -91,10 +95,9 @@ def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event
 
 
 def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> Event:
-    """A step of a trial begins (`on`) or ends. None begins in a break, or after the end, nor with a rendering that its
-    program has not confirmed.
-    Raises `RefusedError` for these, and for a step that the trial does not have. `at`: time in s.
-    """
+    """Event: step `step` (from 0) of a pending trial begins (`on`) or ends. Raises `RefusedError` if the trial is not
+    pending or has no such step; and for a beginning, during a break, after the end, or with a rendering that is not
+    confirmed."""
     pending = _live(state, trial)
     if on and state.screen != "trial":
         raise RefusedError("paused", f"no step of trial {trial} begins now: the screen shows {state.screen}.")
@@ -108,9 +111,10 @@ def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> E
 
 
 def missed(state: LiveSession, trial: int, show: str, reason: str, at: float) -> Event:
-    """What was to be presented was not: too late, too far off, or the program failed. The trial is void, by rule.
+    """Event: a stimulus program did not present `show` as requested (too late, too far off, or it failed); voids the
+    trial.
 
-    Raises `RefusedError` where that trial is not the one that is on.
+    Raises `RefusedError` if that trial is not pending.
     """
     _live(state, trial)
     return _event(state, "missed", at, id=trial, show=show, reason=reason)
@@ -127,12 +131,12 @@ def answer(
     telemetry: Mapping[str, int] | None = None,
     felt: bool = True,
 ) -> Event | None:
-    """A participant's answer; None if this very answer (trial, client id and values) has been accepted already.
+    """Event for a participant's answer; None if this very answer (trial, client id and values) is accepted already.
 
     `values`: class_a, class_b (responses of the study), preferred ("a" or "b"), as the phase asks. `browser`: its time
-    and the response time, s; numbers by name. `telemetry`: counts of the device's samples while the trial was felt, all
-    of them (`samples`) and those with each flag; None where none were recorded. `felt`: refuse an answer to what was
-    not felt. Raises RefusedError.
+    and the response time, s; numbers by name. `telemetry`: counts of the device's samples during the trial, in total
+    (`samples`) and with each flag; None if none were recorded. `felt`: refuse an answer before all sides were
+    presented. Raises RefusedError, also for another answer to an answered trial, and for a trial that is over.
     """
     if not isinstance(trial, int) or isinstance(trial, bool) or not isinstance(client, str) or not client:
         raise RefusedError("bad-answer", "an answer needs the number of its trial and the id of its client.")
@@ -156,7 +160,7 @@ def answer(
 
 
 def undo(state: LiveSession, at: float, reason: str = "") -> Event:
-    """Take the last answer back; its rendering is asked again. Raises `RefusedError` if there is none."""
+    """Event that takes back the last answer; its trial is asked again. Raises `RefusedError` if there is none."""
     _running(state)
     last = state.last_answered
     if last is None:
@@ -165,10 +169,10 @@ def undo(state: LiveSession, at: float, reason: str = "") -> Event:
 
 
 def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
-    """Feel the pending trial once more from its first step; or an answered one, later, as a check of consistency.
+    """Event that restarts the pending trial (`trial` None, or its id), or presents an answered one again later, as a
+    check of consistency. The answer to such a repetition has the phase "repeat" and is never fitted.
 
-    The answer to a repeated trial of the second kind has the phase "repeat" and is never fitted.
-    Raises `RefusedError` if there is none, or if it is a repetition itself.
+    Raises `RefusedError` if there is no such trial, or it is an answered repetition itself.
     """
     _running(state)
     repeated = state.pending if trial is None else state.trial(trial)
@@ -180,10 +184,8 @@ def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
 
 
 def void(state: LiveSession, trial: int, reason: str, at: float) -> Event:
-    """A trial shall not count; its rendering is asked again. This excludes nothing, however often.
-
-    Raises `RefusedError` if it does not count already.
-    """
+    """Event: a pending or answered trial shall not count; it is asked again. Unlike stops of the device, voiding a
+    rendering never excludes it. Raises `RefusedError` if the trial does not count already."""
     _running(state)
     voided = state.trial(trial)
     if voided.status not in ("pending", "answered"):
@@ -192,7 +194,8 @@ def void(state: LiveSession, trial: int, reason: str, at: float) -> Event:
 
 
 def restore(state: LiveSession, trial: int, at: float) -> Event:
-    """A voided answer shall count after all. Raises RefusedError if its place has been filled."""
+    """Event: a voided answer shall count after all. Raises RefusedError if it is none, or another answer has its
+    place."""
     _running(state)
     voided = state.trial(trial)
     if voided.status != "void" or voided.values is None:
@@ -203,7 +206,11 @@ def restore(state: LiveSession, trial: int, at: float) -> Event:
 
 
 def skip(state: LiveSession, reason: str, at: float, trial: int | None = None) -> Event:
-    """The pending planned trial is left out for good: one that the device has stopped twice. Raises RefusedError."""
+    """Event: the pending planned trial, which the device has stopped twice, is left out for good; `trial` is its id, or
+    None.
+
+    Raises RefusedError if there is no such trial.
+    """
     _running(state)
     skipped = state.skippable
     if skipped is None or trial not in (None, skipped.id):
@@ -212,7 +219,8 @@ def skip(state: LiveSession, reason: str, at: float, trial: int | None = None) -
 
 
 def _filled(state: LiveSession, trial: Trial) -> bool:
-    """Whether another answer counts in the place of a voided one."""
+    """Whether the place of a voided trial is taken: by another answer, since its block has all its answers, or for a
+    voided repetition, since it is no longer wanted or pending."""
     if trial.repeats is not None:
         pending = state.pending
         waits = trial.repeats in state.wanted or (pending is not None and pending.repeats == trial.repeats)
@@ -227,7 +235,7 @@ def _filled(state: LiveSession, trial: Trial) -> bool:
 
 
 def restorable(state: LiveSession, trial: int) -> bool:
-    """Whether `restore` would be accepted."""
+    """Whether `restore` would be accepted for this trial."""
     try:
         restore(state, trial, 0.0)
     except RefusedError:
@@ -236,7 +244,7 @@ def restorable(state: LiveSession, trial: int) -> bool:
 
 
 def pause(state: LiveSession, by: str, at: float) -> Event:
-    """A break, asked for by "participant" or "experimenter". Raises `RefusedError` in a break."""
+    """Event that begins a break, requested by "participant" or "experimenter". Raises `RefusedError` during a break."""
     _running(state)
     if state.paused is not None:
         raise RefusedError("paused", "the session is paused already.")
@@ -244,7 +252,7 @@ def pause(state: LiveSession, by: str, at: float) -> Event:
 
 
 def resume(state: LiveSession, at: float) -> Event:
-    """The end of a break. Raises `RefusedError` if there is none."""
+    """Event that ends a break. Raises `RefusedError` if there is none."""
     _running(state)
     if state.paused is None:
         raise RefusedError("nothing", "the session is not paused.")
@@ -252,21 +260,22 @@ def resume(state: LiveSession, at: float) -> Event:
 
 
 def abort(state: LiveSession, reason: str, at: float) -> Event:
-    """The end of the session before its time. Raises `RefusedError` when it has ended, and for a reason that a
-    spreadsheet would run."""
+    """Event that ends the session early. Raises `RefusedError` if it is aborted already, and for a reason that a
+    spreadsheet would run as a formula."""
     _running(state)
     return _event(state, "abort", at, reason=_text(reason))
 
 
 def note(state: LiveSession, text: str, at: float) -> Event:
-    """The experimenter's words. Raises `RefusedError` for words that a spreadsheet would run."""
+    """Event with a note of the experimenter. Raises `RefusedError` for text that a spreadsheet would run as a
+    formula."""
     return _event(state, "note", at, text=_text(text))
 
 
 def more(state: LiveSession, at: float) -> Event:
-    """Another rendering of the warm-up, at its end.
+    """Event that adds one trial to a warm-up that has ended.
 
-    Raises `RefusedError` elsewhere, and when all of its renderings have been felt.
+    Raises `RefusedError` elsewhere, and if all renderings of the warm-up are used.
     """
     before = None if state.block is None else state.warm_up(state.block)
     if state.screen != "ready" or before is None:
@@ -277,24 +286,26 @@ def more(state: LiveSession, at: float) -> Event:
 
 
 def go_on(state: LiveSession, at: float) -> Event:
-    """From the end of the warm-up, or of a rest, to the next block. Raises `RefusedError` anywhere else."""
+    """Event that begins the next block after a warm-up or a rest. Raises `RefusedError` on any other screen."""
     if state.screen not in ("ready", "rest"):
         raise RefusedError("nothing", "there is nothing to go on to: no warm-up or rest has come to its end.")
     return _event(state, "go_on", at, block=state.block)
 
 
 def warm_up(state: LiveSession, at: float) -> Event:
-    """The warm-up comes again, since a pause has been as long as the study says. Raises `RefusedError` otherwise."""
+    """Event that repeats the warm-up after a pause as long as the study specifies. Raises `RefusedError` if none is
+    due."""
     if not state.warms_up_again(at) or state.block is None or state.active is None:
         raise RefusedError("nothing", "the warm-up does not come again now.")
     return _event(state, "warm_up", at, block=state.warm_up(state.block), pause_s=at - state.active)
 
 
 def device(state: LiveSession, condition: str, at: float, *, trial: int | None = None, **facts) -> Event:
-    """The device says "ready", "running", "stopped", "hold", "estop" or "lost"; `facts`: its counters and reason.
+    """Event for a device's condition: "ready", "running", "stopped", "hold", "estop" or "lost"; `facts`: counters and
+    reason.
 
-    With hold, estop or lost the trial (by default the pending one) is void if it had begun. Raises `RefusedError` for a
-    `trial` that there is not.
+    With hold, estop or lost, the trial (None: the pending one) is voided if it had begun. Raises `RefusedError` for a
+    `trial` that does not exist.
     """
     if trial is not None:
         state.trial(trial)
@@ -302,18 +313,21 @@ def device(state: LiveSession, condition: str, at: float, *, trial: int | None =
 
 
 def _number(state, phase, material):
+    """Number (from 1) of the next trial within its phase and material."""
     same = (t for t in state.trials if t.data["phase"] == phase and t.data["material"] == material)
     return 1 + sum(1 for _ in same)
 
 
 def _event(state, kind, at, **data):
+    """Event of this kind with the next sequence number and `data`. Raises RefusedError for a time that is not
+    finite."""
     if not math.isfinite(at):
         raise RefusedError("bad-answer", f"the time {at} is no time.")
     return Event(seq=state.seq + 1, kind=kind, time=float(at), data=data)
 
 
 def _text(text: str) -> str:
-    """Words that will stand in a table as they are. Raises RefusedError for what a spreadsheet would run."""
+    """Return a text unchanged. Raises RefusedError for one that a spreadsheet would run as a formula."""
     if runs_in_a_spreadsheet(text):
         raise RefusedError(
             "bad-answer", f'the text "{text[:40]}" holds what a spreadsheet would run as a formula; write it otherwise.'
@@ -322,11 +336,13 @@ def _text(text: str) -> str:
 
 
 def _running(state):
+    """Raise RefusedError if the session was aborted."""
     if state.aborted is not None:
         raise RefusedError("over", "the session has ended.")
 
 
 def _live(state, id):
+    """Return the trial with this id. Raises RefusedError if it does not exist or is not pending."""
     trial = state.trial(id)
     if trial.status != "pending":
         raise RefusedError("old-trial", f"trial {id} is {trial.status}.")
@@ -334,6 +350,8 @@ def _live(state, id):
 
 
 def _times(browser):
+    """Copy of the browser's times as floats; {} for None. Raises RefusedError for anything but up to 8 finite numbers
+    by name."""
     if browser is None:
         return {}
     good = isinstance(browser, Mapping) and len(browser) <= 8
@@ -346,7 +364,8 @@ def _times(browser):
 
 
 def _counts(telemetry: Mapping[str, int]) -> dict[str, int]:
-    """Counts of samples. Raises RefusedError for what are none."""
+    """Copy of telemetry counts. Raises RefusedError for unknown names, or counts outside of 0 to the number of
+    samples."""
     names, every = set(telemetry), telemetry.get(SAMPLES, -1)
     if (
         SAMPLES not in names
@@ -358,6 +377,8 @@ def _counts(telemetry: Mapping[str, int]) -> dict[str, int]:
 
 
 def _check_values(state, trial, values):
+    """Raise RefusedError if `values` are not exactly the answers that the trial's phase asks for, each an allowed
+    one."""
     asks = protocol(state.study.session, state.header.blocks[trial.block].phase).asks
     if not isinstance(values, Mapping) or set(values) != set(asks):
         raise RefusedError("bad-answer", f"an answer to trial {trial.id} has {', '.join(asks)}, and nothing else.")

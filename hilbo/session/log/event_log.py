@@ -1,8 +1,8 @@
-"""A session on disk: JSON Lines, appended and forced to the disk one event at a time, read back whole or refused.
+"""A session on disk: JSON Lines, appended and synced one event at a time, read back whole or refused.
 
-What a line is, and what of a damaged file counts, is in `hilbo.session.log.log_lines`; a last line that lacks its
-newline gets it when the log is opened for writing, and one that is cut off within goes. One writer at a time, by a
-lock of the operating system on the file, which goes with the process that holds it. A log is its owner's alone to read.
+`hilbo.session.log.log_lines` defines the lines, and how damage is treated: when a log is opened for writing, a last
+line without its newline gets it, and an incomplete one is cut off. Only one process writes a log, by a lock of the
+operating system on the file, which ends with the process. Only the file's owner may read it.
 """
 
 import os
@@ -31,21 +31,22 @@ _OPEN = os.O_RDWR | os.O_APPEND | getattr(os, "O_BINARY", 0)
 
 
 class LogError(RuntimeError):
-    """An event is not on the disk, and does not count."""
+    """An event could not be written to the disk, and is not part of the session."""
 
 
 class LogLostError(LogError):
-    """The file at the log's path is no longer the open log; nothing can be acknowledged any more."""
+    """The file at the log's path is no longer the open log; no event can be acknowledged any more."""
 
 
 class EventLog:
-    """An open log: `create` a new one or `resume` one, then `append` events; `state` is always the fold of the file.
+    """An open, locked log: `create` a new one or `resume` one, then `append` events. `state`: session after all events
+    of the file.
 
-    `dropped`: fault of the last line when the log was opened, or "". `sync_s`: duration of the last fsync (s).
-    `before`: the events that were in it when it was opened.
+    `dropped`: sentence on an incomplete last line when the log was opened, or "". `sync_s`: duration of the last write
+    with its fsync (s). `before`: the events that were in it when it was opened.
 
     A log that was deleted, moved, replaced or edited while it is open raises `LogLostError` from then on; the events
-    that were acknowledged are written to a copy beside it, once.
+    that were acknowledged are written once to a copy next to it.
     """
 
     def __init__(
@@ -64,7 +65,12 @@ class EventLog:
 
     @classmethod
     def create(cls, path: str | os.PathLike, study: StudyFile, header: Header) -> "EventLog":
-        """Begin a log. Raises InputError if there is one already, or it cannot be written."""
+        """Create the log of a new session, with its folder, write and sync the header line, and lock the file.
+
+        A file with nothing but an incomplete header line is overwritten. Raises InputError for a header that is not
+        valid, and if there is a log already, it is locked, or it cannot be created; LogError if the header cannot be
+        written.
+        """
         path = Path(path)
         state = LiveSession.start(study, header)
         check_new_header(study, header)
@@ -91,7 +97,11 @@ class EventLog:
 
     @classmethod
     def resume(cls, path: str | os.PathLike, study: StudyFile) -> "EventLog":
-        """Open a log to go on with it; a last line that is not whole is cut off. Raises InputError."""
+        """Open and lock an existing log to append to it, and check all of its events.
+
+        An incomplete last line is cut off the file, a missing last newline is added. Raises InputError if there is no
+        log, or it is locked, damaged, or of another study.
+        """
         path = Path(path)
         try:
             file = os.open(path, _OPEN)
@@ -111,7 +121,10 @@ class EventLog:
         return cls(path, file, state, lines, dropped, events)
 
     def append(self, event: Event) -> LiveSession:
-        """Put an event on the disk, and only then into the state, which is returned. Raises LogError."""
+        """Write and sync an event, and only then apply it to `state`, which is returned.
+
+        Raises LogError, LogLostError or InputError; `state` is then unchanged.
+        """
         line = self._line(event)
         state = self.state.after(event)
         self.check()
@@ -122,10 +135,11 @@ class EventLog:
         return state
 
     def check(self) -> None:
-        """Raise LogLostError if the file at the log's path is not this log as it was written, or was not at an earlier
+        """Raise LogLostError if the file at the log's path is not this log as it was written, now or at an earlier
         check.
 
-        The acknowledged events are copied the first time; if that fails, it is tried again at each call.
+        Before it is raised, the acknowledged events are copied to a new file next to it; if that fails, each call tries
+        again.
         """
         if not self._torn:
             self._fault = self._fault or fault_of(self.path, self._file, self._size)
@@ -146,7 +160,8 @@ class EventLog:
         )
 
     def _line(self, event: Event) -> bytes:
-        """The event's line, which a reader would accept. Raises LogError."""
+        """Return the event's line, after a check that a reader would accept it. Raises LogError if not. Writes
+        nothing."""
         line = event_line(event, self._lines[-1])
         try:
             check_types(event_of(line, self.path))
@@ -155,6 +170,10 @@ class EventLog:
         return line
 
     def _write(self, line):
+        """Append the bytes `line` to the file and sync it; update the expected size and `sync_s`.
+
+        If that fails, the file is cut back to its former size, now or before the next write, and LogError is raised.
+        """
         begun = time.perf_counter()
         try:
             if self._torn:
@@ -177,7 +196,7 @@ class EventLog:
         self.sync_s = time.perf_counter() - begun
 
     def close(self) -> None:
-        """Let others write."""
+        """Close the file, which ends its lock; a second call does nothing."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
@@ -190,7 +209,11 @@ class EventLog:
 
 
 def read_log(path: str | os.PathLike, study: StudyFile | None = None) -> tuple[Header, list[Event], str]:
-    """Header, events, and what was dropped at the end; for readers, without a lock. Raises InputError."""
+    """Read the header and the events of a log, and a sentence on an incomplete last line ("" if there is none).
+
+    Takes no lock. Checks the lines and, if `study` is given, that the log is of that study, but not whether the events
+    fit the state: see `read_session`. Raises InputError.
+    """
     header, events, _, dropped = read_lines(read_bytes(path), path)
     if study is not None:
         _check_study(path, study, header)
@@ -200,8 +223,11 @@ def read_log(path: str | os.PathLike, study: StudyFile | None = None) -> tuple[H
 def read_session(
     path: str | os.PathLike, study: StudyFile, note: Callable[[str], Any] = lambda sentence: None
 ) -> LiveSession:
-    """The session of a log, every event checked; for readers, without a lock. `note` is told of what was dropped at the
-    end. Raises InputError."""
+    """Read a log and return the state after its events, each of them checked; takes no lock.
+
+    `note` is called with the sentence on an incomplete last line, if there is one. Raises InputError if the file cannot
+    be read, is damaged, or belongs to another study.
+    """
     header, events, dropped = read_log(path, study)
     if dropped:
         note(dropped)
@@ -209,8 +235,8 @@ def read_session(
 
 
 def _end(file, path, content, size):
-    """Bring a log to the end of its last good line: a torn line is cut off, a missing newline is added. Raises
-    InputError."""
+    """Make an open log end with its last complete line. `content`: bytes of the file; `size`: bytes of its complete
+    lines, with their newlines. Cuts off what follows, or adds the missing newline. Raises InputError if that fails."""
     if size == len(content):
         return
     try:
@@ -224,6 +250,7 @@ def _end(file, path, content, size):
 
 
 def _check_study(path, study, header):
+    """Raise InputError if the header has the hash of another study; `path` is for the message."""
     if header.study != study.hash:
         raise InputError(
             f"{path}: is the log of another study ({header.study}, not {study.hash}); use the study file that it was"
@@ -232,6 +259,8 @@ def _check_study(path, study, header):
 
 
 def _folded(path, study, header, events) -> LiveSession:
+    """Return the state after the events, each of them checked. Raises InputError, with `path`, also for another
+    study."""
     _check_study(path, study, header)
     try:
         return replayed(study, header, events)
@@ -240,13 +269,14 @@ def _folded(path, study, header, events) -> LiveSession:
 
 
 def _cut(file, size):
-    """Cut a half-written line off. Raises OSError. A file that another program made shorter does not grow again."""
+    """Cut an open file to `size` bytes and sync it; a shorter file stays as it is. Raises OSError."""
     if os.fstat(file).st_size > size:
         os.ftruncate(file, size)
         os.fsync(file)
 
 
 def _content(file) -> bytes:
+    """Read all bytes of an open file, given by its descriptor."""
     os.lseek(file, 0, os.SEEK_SET)
     pieces = []
     while piece := os.read(file, 2**20):

@@ -1,4 +1,4 @@
-"""What a session is to be, before it begins: its blocks, its warm-up, and the seeds of what is chosen in it."""
+"""Headers of sessions before they begin: blocks, warm-up, and random seeds."""
 
 import hashlib
 from collections.abc import Sequence
@@ -18,28 +18,31 @@ _SPARE = 2  # warm-up renderings in store: so many times the least number
 
 
 def seed_of(seed: int, *place: int) -> int:
-    """A seed below 2^31 for a place in a study, from the study's."""
+    """Derive a seed below 2^31 from the study's seed and the integers `place`."""
     return int(np.random.SeedSequence([seed, *place]).generate_state(1)[0] >> 1)
 
 
 def participant_seed(seed: int, participant: str) -> int:
-    """The seed of a person's sessions, from the study's and their id: people who are planned in several batches, or
-    without a plan, do not meet the same points, so that all of them together cover the space."""
+    """Derive the seed of a participant's sessions from the study's seed and the id, so that participants who are
+    planned in several batches, or without a plan, are not given the same points, and together cover the space."""
     return seed_of(seed, int.from_bytes(hashlib.sha256(participant.encode()).digest()[:4]))
 
 
 def material_seed(header: Header, material: str | None) -> int:
-    """The seed of what is chosen with a material, from the session's, the material's name and the session's label:
-    points that came again in the same order would be recognised, and no order balances that. Without a material, and
-    with the label "1", it is the session's own, as `hilbo.Session` has it.
-    """
+    """Derive the seed for the choices with one material from the session's seed, the material's name and the session's
+    label, so that no participant meets the same points in the same order twice. Without a material and with the label
+    "1" it is the session's own seed, as in `hilbo.Session`."""
     name = (material or "") + ("" if header.session == "1" else f"\n{header.session}")  # neither has a line's end in it
     digest = hashlib.sha256(name.encode()).digest()
     return seed_of(header.seed, int.from_bytes(digest[:4])) if name else header.seed
 
 
 def warm_up(study: StudyFile, seed: int, material: str | None = None) -> tuple[Block, dict[str, dict[str, float]]]:
-    """The warm-up: spread, feasible renderings from the seed, as many again for "another one"; and their sets."""
+    """Return a warm-up block of space-filling, feasible renderings, and their sets (name -> parameters in physical
+    units).
+
+    The block has twice as many planned trials as it needs, in store for "another one". Loads JAX.
+    """
     from hilbo.search.rendering import Rendering  # with JAX, which nothing else here needs
     from hilbo.search.space import SearchSpace
 
@@ -62,7 +65,8 @@ def header_for(
     warm: bool = True,
     **others: Any,
 ) -> Header:
-    """An optimisation session: a warm-up, then the study's trials with each material. `others`: fields of Header."""
+    """Return the header of an optimisation session: a warm-up (unless `warm` is False), then the study's number of
+    trials with each of the `materials`. `others`: further fields of Header."""
     blocks, sets = [], {}
     if warm:
         block, sets = warm_up(study, seed, materials[0])
@@ -82,7 +86,8 @@ def header_of(
     sets: dict[str, dict[str, float]],
     **others: Any,
 ) -> Header:
-    """The header of a session of these blocks, with what it says of the study."""
+    """Return the header of a session with these blocks; hash and language are the study's. `others`: further fields of
+    Header."""
     return Header(
         study=study.hash,
         participant=participant,

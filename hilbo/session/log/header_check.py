@@ -1,4 +1,4 @@
-"""What a session's header has to be, wherever it comes from: a plan, a log, or the command line."""
+"""Checks of a session's header, whether it comes from a plan, a log, or the command line."""
 
 import math
 
@@ -18,12 +18,13 @@ _DAY = 86_400.0  # s
 
 
 def study_of(study: StudyFile, material: str | None) -> StudyFile:
-    """The study of one material; None for a study, or a session, without."""
+    """The study file of one material; for None the study itself."""
     return study if material is None else study.material(material)
 
 
 def check_header(study: StudyFile, header: Header) -> None:
-    """Refuse a header that no session of this study can have. Raises InputError."""
+    """Raise InputError for a header that is not valid for this study: schema, participant, label, seed, blocks or
+    sets."""
     if header.schema != SCHEMA:
         raise InputError(f"the session's header is of schema {header.schema}; this hilbo reads {SCHEMA}.")
     person = header.participant
@@ -42,7 +43,7 @@ def check_header(study: StudyFile, header: Header) -> None:
 
 
 def check_label(label: str) -> None:
-    """Refuse what no session can be called. Raises InputError."""
+    """Raise InputError for a session label that is empty, too long, or has characters that cannot be printed."""
     if not 0 < len(label) <= _LABEL or not label.isprintable():
         words = "".join(c if c.isprintable() else "?" for c in label[:_LABEL])
         raise InputError(
@@ -51,8 +52,8 @@ def check_label(label: str) -> None:
 
 
 def check_new_header(study: StudyFile, header: Header) -> None:
-    """Refuse a header with which no session may begin: one that `check_header` refuses, or with an id or words against
-    the rules for them. Raises InputError."""
+    """Raise InputError for a header with which no session may begin: one that `check_header` refuses, an id that is not
+    pseudonymous, or a label or name of a set that a spreadsheet would run as a formula."""
     check_header(study, header)
     check_id(header.participant, "the session's header")
     check_text(header.session, "the session's label")
@@ -62,6 +63,9 @@ def check_new_header(study: StudyFile, header: Header) -> None:
 
 
 def _check_block(study: StudyFile, header: Header, block: Block, place: str) -> None:
+    """Raise InputError for a block with too many trials or too long a rest, no planned trials where its phase needs
+    them, a wrong number of sides, or sets that the header lacks or that are out of range. `place` names the block in
+    messages."""
     if not 0 <= block.count <= _MOST or not 0 <= block.rest <= _DAY:
         raise InputError(f"{place} has {block.count} trials after {block.rest:g} s of rest, which is no session's.")
     here = study_of(study, block.material)

@@ -1,4 +1,4 @@
-"""Names of logs, and the logs of a folder."""
+"""File names of logs, and the logs in a folder."""
 
 import contextlib
 import hashlib
@@ -20,7 +20,7 @@ _PLAIN = re.compile("[a-zA-Z0-9.-]+")
 
 
 def begun(path: str | os.PathLike) -> bool:
-    """Whether there is a session at this path, or another file: not where a log was killed within its first line."""
+    """Whether there is a file at this path with anything but an empty or incomplete first line of a log."""
     try:
         with open(path, "rb") as file:
             return not is_unbegun(file.readline())
@@ -29,7 +29,7 @@ def begun(path: str | os.PathLike) -> bool:
 
 
 def in_use(path: str | os.PathLike) -> bool:
-    """Whether somebody is writing this log."""
+    """Whether another process has locked this log to write it. Raises OSError if it cannot be opened."""
     file = os.open(path, os.O_RDWR)
     try:
         lock(file, Path(path))
@@ -41,8 +41,8 @@ def in_use(path: str | os.PathLike) -> bool:
 
 
 def log_name(header: Header) -> str:
-    """File name of a session's log, of no other session: the last "_" is before the label, and one with other
-    characters than letters, digits, "." and "-" ends in a part of its SHA-256."""
+    """File name of a session's log, PARTICIPANT_LABEL.session.jsonl, different for every session. A label with other
+    characters than letters, digits, "." and "-" gets them replaced by "-", and a part of its SHA-256 appended."""
     label = header.session
     if not _PLAIN.fullmatch(label):
         label = f"{re.sub(r'[^a-zA-Z0-9.-]', '-', label)}~{hashlib.sha256(label.encode()).hexdigest()[:8]}"
@@ -50,8 +50,8 @@ def log_name(header: Header) -> str:
 
 
 def check_new(path: Path, header: Header) -> None:
-    """Refuse to begin a session at `path` that has been begun: there, or under another name in this folder. Raises
-    InputError."""
+    """Raise InputError if the session to be begun at `path` exists: there is a file, or another log in its folder has
+    the same participant and label."""
     if begun(path):
         raise InputError(
             f"{path}: this session has been begun; add --resume to go on with it, or choose another --session."
@@ -65,8 +65,8 @@ def check_new(path: Path, header: Header) -> None:
 
 
 def check_alone(path: Path, header: Header) -> None:
-    """Refuse a session whose participant has another one that is running, from a log of the same folder: whoever it is
-    whose id is wrong, the answers of two people would be one's. Dry runs are nobody's. Raises InputError."""
+    """Raise InputError if another log in the folder of `path`, of the same participant, is being written: one of the
+    two ids must be wrong. Dry runs are not considered."""
     for other, first in _theirs(path, header.participant):
         if not first.dry_run and not header.dry_run and in_use(other):
             raise InputError(
@@ -76,7 +76,8 @@ def check_alone(path: Path, header: Header) -> None:
 
 
 def _theirs(path: Path, participant: str) -> Iterator[tuple[Path, Header]]:
-    """The other logs of a participant in the folder of this one, with their headers."""
+    """Yield the path and the header of each other log of a participant in the folder of `path`; unreadable logs are
+    left out."""
     for other in log_paths(path.parent):
         with contextlib.suppress(InputError, OSError), open(other, "rb") as file:  # a damaged log is nobody's
             header = read_lines(file.readline(), other).header
@@ -85,14 +86,16 @@ def _theirs(path: Path, participant: str) -> Iterator[tuple[Path, Header]]:
 
 
 def keys_path(log: Path) -> Path:
-    """The file beside a log that keeps the keys of its browsers. It has the log's own name, so that no other session
-    can have it."""
+    """Path of the file next to a log that contains the keys of its browsers: .PARTICIPANT_LABEL.keys."""
     return log.with_name(f".{log.name.removesuffix(SUFFIX)}.keys")
 
 
 def log_paths(folder: str | os.PathLike, note: Callable[[str], object] = lambda sentence: None) -> list[Path]:
-    """The logs in a folder that were begun, in the order of their names. `note` gets a sentence on each log that is
-    left out: without a whole first line, under another name, or a copy of a log that was lost."""
+    """Paths of the logs in a folder, sorted by name; empty if there is no such folder.
+
+    `note` is called with a sentence on each log that is left out: without a complete first line, under a name that does
+    not end in .session.jsonl, or a copy of a lost log.
+    """
     whole = []
     for path in sorted(Path(folder).iterdir() if Path(folder).is_dir() else ()):
         if not path.is_file() or path.name.startswith("._"):  # AppleDouble files, which macOS writes on other disks
@@ -108,7 +111,7 @@ def log_paths(folder: str | os.PathLike, note: Callable[[str], object] = lambda 
 
 
 def is_log(path: str | os.PathLike) -> bool:
-    """Whether a file begins as a session's log does, whatever its name."""
+    """Whether a file begins like a session's log, whatever its name; False if it cannot be read."""
     try:
         with open(path, "rb") as file:
             return file.read(len(FIRST)) == FIRST
@@ -117,6 +120,8 @@ def is_log(path: str | os.PathLike) -> bool:
 
 
 def _other_name(path: Path) -> str:
+    """Sentence on a log that `log_paths` leaves out because of its name: a copy of a lost log, or a log that was
+    renamed."""
     if path.name.endswith(RESCUED):
         return (
             f"{path}: is a copy of a session whose log was deleted, moved or changed while it ran, and is left out;"

@@ -1,13 +1,13 @@
-"""The lines of a session's log, as bytes: made, and read back with every digest checked.
+"""The lines of a session's log as bytes: creation, and reading with every digest checked.
 
 The first line is the header, every other an event:
 
     {"seq":1,"kind":"propose","time":…,"data":{…},"previous":"…","crc":"…"}
 
-`previous` is the start of the SHA-256 of the line before, `crc` the CRC-32 of this line up to it. A last line that
-lacks nothing but its newline counts; one that is cut off within is left out, and said so; a file without a whole first
-line is no log yet. Any other damage is refused with its line. Neither digest has a secret, so that events are checked
-for what they say too (`hilbo.session.log.replay`).
+`previous` is the start of the SHA-256 of the line before, `crc` the CRC-32 of this line up to it. A last line that is
+complete but for its newline counts; an incomplete one is left out with a note; a file without a complete first line is
+not a log yet. Any other damage is refused with its line number. Neither digest has a secret, so the content of events
+is checked too (`hilbo.session.log.replay`).
 """
 
 import hashlib
@@ -36,8 +36,8 @@ _CRC = re.compile(rb',"crc":"([0-9a-f]{8})"\}\n\Z')
 
 
 class Read(NamedTuple):
-    """What a log holds. `lines`: the good ones, each with its newline; `dropped`: a sentence on what follows them, or
-    "" where nothing does."""
+    """Content of a log. `lines`: the intact ones, each with its newline; `dropped`: a sentence on an incomplete last
+    line, or "" if there is none."""
 
     header: Header
     events: list[Event]
@@ -57,28 +57,31 @@ class _Line(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def header_line(header: Header) -> bytes:
-    """The first line of a log that begins now."""
+    """Return the first line of a log, with the current time."""
     return _line(0, "header", time.time(), msgspec.to_builtins(header), b"")
 
 
 def event_line(event: Event, previous: bytes) -> bytes:
-    """The line of an event after the line `previous`."""
+    """Return the line of an event that follows the line `previous` (bytes with the newline)."""
     return _line(event.seq, event.kind, event.time, event.data, previous)
 
 
 def event_of(line: bytes, place: str | os.PathLike) -> Event:
-    """The event of a line, as a reader gets it. Raises InputError."""
+    """Decode the event in a line; its digests are not checked. Raises InputError, in which `place` names the file."""
     raw = decoded(line, _Line, str(place), _WHAT)
     return Event(seq=raw.seq, kind=raw.kind, time=raw.time, data=raw.data)
 
 
 def is_unbegun(content: bytes) -> bool:
-    """Whether this is the beginning of a log's first line, without its end."""
+    """Whether the content of a file is empty or an incomplete first line of a log."""
     return b"\n" not in content and content[: len(FIRST)] == FIRST[: len(content)]
 
 
 def read_lines(content: bytes, path: str | os.PathLike) -> Read:
-    """What a file holds. Raises InputError, with the line, where it is damaged, and where it holds no session."""
+    """Decode the content of a log file and check all digests; `path` is for messages.
+
+    Raises InputError, with the line, if it is damaged, and if it has no complete first line.
+    """
     dropped, header, events, good = "", None, [], []
     for number, line in enumerate(filter(None, re.split(rb"(?<=\n)", content)), 1):
         if not line.endswith(b"\n"):
@@ -98,16 +101,20 @@ def read_lines(content: bytes, path: str | os.PathLike) -> Read:
 
 
 def _line(seq: int, kind: str, at: float, data: Mapping[str, Any], previous: bytes) -> bytes:
+    """Encode a line: the fields, the hash of the line `previous`, the CRC-32, and a newline. `at`: time in s."""
     body = {"seq": seq, "kind": kind, "time": at, "data": data, "previous": _hash(previous)}
     text = msgspec.json.encode(body)[:-1]
     return text + b',"crc":"%08x"}\n' % zlib.crc32(text)
 
 
 def _hash(line: bytes) -> str:
+    """First 16 hex digits of the SHA-256 of a line; "" for the empty line before the first."""
     return hashlib.sha256(line).hexdigest()[:16] if line else ""
 
 
 def _checked(line: bytes, number: int, previous: bytes, path: str | os.PathLike) -> _Line:
+    """Decode line `number` (from 1) and check its CRC-32, sequence number, kind, and the hash of the line `previous`.
+    Raises InputError."""
     if not _fits(line):
         raise InputError(f"{path}:{number}: is damaged; restore the file from a copy, nothing after it can be trusted.")
     raw = decoded(line, _Line, f"{path}:{number}", _WHAT)
@@ -119,6 +126,6 @@ def _checked(line: bytes, number: int, previous: bytes, path: str | os.PathLike)
 
 
 def _fits(line: bytes) -> bool:
-    """Whether a line is what its checksum says."""
+    """Whether a line, with its newline, ends in the CRC-32 of the bytes before it."""
     checksum = _CRC.search(line)
     return checksum is not None and int(checksum[1], 16) == zlib.crc32(line[: checksum.start()])

@@ -1,9 +1,8 @@
-"""What a program confirms that it has presented, held against what it was asked for; pure.
+"""Comparison of the values that a stimulus program confirms with those requested; pure functions.
 
-The study says how far each value may be off (`hilbo.study.file.stimuli`). Within that, the confirmed value is what
-counts: fits, tables and maps have it, the proposal stays in the log. A value beyond an end of the parameter's range
-counts as that end: a 32-bit number of the end itself may lie beyond it, and no table holds what is outside. Of a
-parameter with steps the nearest one counts.
+The study defines the tolerance of each value (`hilbo.study.file.stimuli`). Within it the confirmed value counts: fits,
+tables and maps have it, and the proposal stays in the log. A value beyond an end of the parameter's range counts as
+that end: a 32-bit number of the end itself may be beyond it. For a parameter with steps the nearest step counts.
 """
 
 import math
@@ -16,9 +15,8 @@ __all__ = ["check_confirmed", "counted", "in_numbers", "in_words"]
 
 
 def check_confirmed(study: StudyFile, asked: Mapping[str, float], values: Mapping[str, float] | None) -> None:
-    """Refuse what is no confirmation of the values asked for (physical units, by name). Raises RefusedError with the
-    code "bad-answer" for what lacks a number, "off" for one that is too far off.
-    """
+    """Raise RefusedError if `values` do not confirm the values `asked` (physical units, by name): with the code
+    "bad-answer" if a number is missing or not finite, "off" if one is beyond the study's tolerance."""
     names = study.space.names
     if values is None or set(values) != set(names):
         raise RefusedError("bad-answer", f"a confirmation has a value for {', '.join(names)}, and for nothing else.")
@@ -41,20 +39,25 @@ def check_confirmed(study: StudyFile, asked: Mapping[str, float], values: Mappin
 
 
 def in_words(study: StudyFile, values: Mapping[str, float]) -> dict[str, float | str]:
-    """Values as whoever presents is told them: levels by their names. What is no parameter, such as K0, stays."""
+    """Values by name as they are shown to people and programs: levels by their names, all else unchanged."""
     parameters = {p.name: p for p in study.space.parameters}
     return {n: parameters[n].shown(v) if n in parameters and parameters[n].levels else v for n, v in values.items()}
 
 
 def in_numbers(study: StudyFile, values: Mapping[str, float | str] | None) -> dict[str, float] | None:
-    """Confirmed values as the log holds them: of a level its place in the study's list. Raises RefusedError with the
-    code "bad-answer" for a text that is none of the levels."""
+    """Confirmed values as the log has them: levels as their index in the study's list; None stays None.
+
+    Raises RefusedError with the code "bad-answer" for a text that is no level of its parameter. A text under a name
+    that is no parameter becomes NaN, which `check_confirmed` refuses.
+    """
     if values is None:
         return None
     return {name: _number(study, name, value) for name, value in values.items()}
 
 
 def _number(study: StudyFile, name: str, value: float | str) -> float:
+    """One confirmed value as a number, a level as its index; NaN for a text under a name that is no parameter. Raises
+    RefusedError for a text that is no level of its parameter."""
     p = next((p for p in study.space.parameters if p.name == name), None)
     if p is None or not (p.levels or isinstance(value, str)):
         return math.nan if isinstance(value, str) else value
@@ -65,6 +68,7 @@ def _number(study: StudyFile, name: str, value: float | str) -> float:
 
 
 def counted(study: StudyFile, values: Mapping[str, float]) -> dict[str, float]:
-    """The values that count for a confirmation that was accepted."""
+    """The values that count for an accepted confirmation: limited to the parameters' ranges, and rounded for discrete
+    ones."""
     inside = {p.name: min(max(float(values[p.name]), p.low), p.high) for p in study.space.parameters}
     return {p.name: float(round(inside[p.name])) if p.discrete else inside[p.name] for p in study.space.parameters}

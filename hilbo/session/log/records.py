@@ -1,6 +1,6 @@
-"""The records of a live session: its header, its events, its trials; and what is refused.
+"""Records of a live session: header, events, trials, and the error for a refused action.
 
-Times are seconds since the epoch, put into events by whoever has a clock.
+Times are seconds since the epoch, and are given by the caller that creates an event.
 """
 
 from collections.abc import Mapping
@@ -22,8 +22,8 @@ Status = Literal["pending", "answered", "undone", "void", "dropped", "left out"]
 
 
 class RefusedError(InputError):
-    """What cannot be done now; `code` says why, for a program: old-trial, voided, answered, unfelt, unconfirmed, off,
-    bad-answer, paused, over, nothing."""
+    """An action that is not possible now. `code` is the reason as a word for programs: old-trial, voided, answered,
+    unfelt, unconfirmed, off, bad-answer, paused, over, nothing."""
 
     def __init__(self, code: str, sentence: str) -> None:
         super().__init__(sentence)
@@ -31,7 +31,8 @@ class RefusedError(InputError):
 
 
 class Event(msgspec.Struct, frozen=True, kw_only=True):
-    """Something that happened: its number in the log (from 1), its kind, when (s since the epoch), and the rest."""
+    """An entry of the log: `seq` is its number (from 1), `kind` one of those in `replay`, `time` in s since the
+    epoch."""
 
     seq: int
     kind: str
@@ -40,10 +41,10 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Header(msgspec.Struct, frozen=True, kw_only=True):
-    """All that decides a session in advance: the first line of its log.
+    """The first line of a log: all that is fixed before a session begins.
 
-    `unblinded`: what showed its participant the parameters, "try" for `hilbo try`; "" where nothing did.
-    `shown_to`: the roles that were shown the parameters of what is presented, where no device of ours does.
+    `unblinded`: what showed the participant the parameters, "try" for `hilbo try`; "" if nothing did. `shown_to`: roles
+    to which the parameters of the stimuli were shown, where a stimulus program presents them.
     """
 
     schema: int = SCHEMA
@@ -65,7 +66,8 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Need(msgspec.Struct, frozen=True):
-    """What a proposal has to be found for: a planned trial, a repeated one, or, with neither, the chooser's next."""
+    """What is to be proposed next: trial `planned` of a block's plan, or a repetition of trial `repeats`; if both are
+    None, a rendering that the chooser selects."""
 
     block: int
     planned: int | None = None
@@ -74,11 +76,12 @@ class Need(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Trial:
-    """A proposal and what became of it. `number` is the row's trial in tables, counted within phase and material.
+    """A proposed trial and its state. `number`: its value in the column `trial` of tables, counted within phase and
+    material.
 
-    `confirmed`: side -> the values that count of what a program presented, where one does; of this presentation alone.
-    `telemetry`: counts of a device's samples while it was felt, up to the answer (`actions.answer`); None without such
-    a record.
+    `confirmed`: side -> the values that count of what a stimulus program presented, if there is one; of this
+    presentation only. `telemetry`: counts of a device's samples while it was presented, up to the answer
+    (`actions.answer`); None without such a record.
     """
 
     id: int
@@ -103,33 +106,35 @@ class Trial:
 
     @property
     def renderings(self) -> dict[str, dict[str, float]]:
-        """Side -> parameters in physical units."""
+        """Side ("a", "b") -> proposed parameters in physical units."""
         return self.data["renderings"]
 
     @property
     def presented(self) -> dict[str, dict[str, float]]:
-        """Side -> parameters in physical units, as they count: the confirmed ones where a program presents them."""
+        """Side -> parameters in physical units that count: the proposed ones, replaced by those that a stimulus program
+        confirmed."""
         return {side: {**values, **self.confirmed.get(side, {})} for side, values in self.renderings.items()}
 
     @property
     def unfinished(self) -> bool:
-        """Whether it has begun and not all of it has been felt to its end: then it has to begin again."""
+        """Whether its presentation has begun and is not complete: a rendering is on, or a side has not been presented.
+        It then has to start again."""
         return self.step is not None and (self.on in self.renderings or self.felt != frozenset(self.renderings))
 
     @property
     def sets(self) -> dict[str, str]:
-        """Side -> name of its set, for planned trials."""
+        """Side -> name of its set, for planned trials; empty for others."""
         return self.data.get("sets", {})
 
     @property
     def first(self) -> str:
-        """The side that is felt first."""
+        """The side that is presented first."""
         return self.data.get("first", "a")
 
 
 class Pause(NamedTuple):
-    """A time of `seconds`, at least `PAUSE`, in which nothing was presented or answered, whatever its cause: a break, a
-    rest, a server that did not run. Event `seq`, of trial `trial`, ended it."""
+    """A pause of `seconds`, at least `PAUSE`, without any presentation or answer, whatever the cause: a break, a rest,
+    or a server that did not run. Event `seq`, of trial `trial`, ended it."""
 
     seq: int
     trial: int
@@ -137,7 +142,7 @@ class Pause(NamedTuple):
 
 
 class WarmUp(NamedTuple):
-    """A warm-up that comes again: its block, the block that follows it, the number of trials before it, and its time
+    """A repetition of the warm-up: its block, the block that follows it, the number of trials before it, and its time
     (s)."""
 
     block: int

@@ -1,9 +1,9 @@
-"""A log's events, each checked before it counts: of its type, and what `hilbo.session.log.actions` would write there.
+"""Checks of a log's events: the types of their data, and whether `hilbo.session.log.actions` could have written them.
 
-An event is made again by the action of its kind in the state before it, and has to come out the same. So a log is
-refused whose lines fit each other and whose content does not: an answer to a trial that was not asked, a rendering
-outside the study's ranges, a trial out of nowhere. What an answer says cannot be checked so: the digests of a log have
-no secret. Which words may be said is asked where they are said, and never here.
+Each event is created again by the action of its kind in the state before it, and must come out the same. So a log is
+refused whose lines are intact but whose content is impossible: an answer to a trial that was not proposed, a rendering
+outside of the study's ranges. Whether an answer was changed cannot be checked: the digests have no secret. Rules for
+free texts (such as reasons) apply only when they are entered, not here.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -92,18 +92,20 @@ class _Device(msgspec.Struct):
 
 
 class _Given:
-    """A chooser that chooses what a log says was chosen."""
+    """A chooser that returns the proposal recorded in a log."""
 
     def __init__(self, proposal: Mapping[str, Any]) -> None:
         self.proposal = proposal
 
     def choose(self, state: LiveSession, need: Need) -> dict[str, Any]:
+        """Return a copy of the recorded proposal, after `_check_proposal`. Raises InputError."""
         _check_proposal(state, need, self.proposal)
         return dict(self.proposal)
 
 
 def _worded(event: Event, **words: str) -> Event:
-    """An event with the words that a log has: no rule for words makes a log unreadable."""
+    """Copy of an event with texts of its data replaced by `words`: texts in a log are accepted even if they break a
+    rule."""
     return msgspec.structs.replace(event, data=event.data | words)
 
 
@@ -140,7 +142,7 @@ _KINDS: dict[str, tuple[type, _Again]] = {
 
 
 def replayed(study: StudyFile, header: Header, events: Iterable[Event]) -> LiveSession:
-    """The state after a log's events, each of them checked. Raises InputError with the number of the event."""
+    """Return the state after a log's events, each of them checked. Raises InputError, with the event's number."""
     check_header(study, header)
     state = LiveSession.start(study, header)
     for event in events:
@@ -150,7 +152,7 @@ def replayed(study: StudyFile, header: Header, events: Iterable[Event]) -> LiveS
 
 
 def check_event(state: LiveSession, event: Event) -> None:
-    """Refuse an event that could not have been written in this state. Raises InputError."""
+    """Raise InputError for an event that could not have been written in this state. Its data are type-checked first."""
     data = check_types(event)
     place = f"event {event.seq}"
     try:
@@ -162,7 +164,8 @@ def check_event(state: LiveSession, event: Event) -> None:
 
 
 def check_types(event: Event) -> object:
-    """The data of an event as the record of its kind. Raises InputError for a kind, a time or data that no log has."""
+    """Return the data of an event as the record of its kind. Raises InputError for an unknown kind, a time out of
+    range, or data of other types."""
     place = f"event {event.seq}"
     if event.kind not in _KINDS:
         raise InputError(f'{place} is of the kind "{event.kind}", which this hilbo does not know.')
@@ -171,11 +174,13 @@ def check_types(event: Event) -> object:
 
 
 def _without(raw: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    """Copy of `raw` without the keys `names`."""
     return {key: value for key, value in raw.items() if key not in names}
 
 
 def _check_proposal(state: LiveSession, need: Need, proposal: Mapping[str, Any]) -> None:
-    """Refuse renderings other than the plan's or the repeated trial's, and chosen ones outside the study's ranges."""
+    """Raise InputError for renderings that differ from the plan or the repeated trial, or, if chosen, are outside of
+    the study's ranges. `proposal`: data of a "propose" event."""
     block, sets = state.header.blocks[need.block], proposal.get("sets")
     renderings: Mapping[str, Mapping[str, float]] = proposal["renderings"]
     study = study_of(state.study, block.material)

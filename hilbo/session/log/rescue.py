@@ -1,8 +1,8 @@
-"""Detection of a log that was deleted, moved, replaced or edited while it is open, and the copy of what it held.
+"""Detection of a log that was deleted, moved, replaced or edited while it is open, and a copy of its content.
 
 An open descriptor survives whatever happens to the path: events would be acknowledged into a file that cannot be found
-again. The path is therefore compared with the descriptor around each write. The copy is meant for a person to inspect:
-its name is not that of a log, so that no command reads it as one.
+again. The path is therefore compared with the descriptor around each write. The copy is meant for a person to inspect;
+it has no log's name, so that no command reads it as a log.
 """
 
 import os
@@ -19,9 +19,10 @@ RESCUED = ".rescued.jsonl"
 
 
 def fault_of(path: Path, file: int, size: int) -> str:
-    """How the file at `path` differs from the open `file` of `size` bytes, as the predicate of a sentence.
+    """Compare the file at `path` with the open file descriptor `file`, expected to have `size` bytes.
 
-    "" if it does not."""
+    Returns the difference (gone, replaced or changed) as the predicate of a sentence, or "" if there is none.
+    """
     try:
         at_path = os.stat(path, follow_symlinks=False)
     except OSError as error:
@@ -34,7 +35,8 @@ def fault_of(path: Path, file: int, size: int) -> str:
 
 
 def rescue(path: Path, lines: Sequence[bytes]) -> Path:
-    """Write the lines of a log to a new file of mode 0600 beside it, and return its path. Raises OSError."""
+    """Write the lines of a log to a new file of mode 0600 next to `path`, and return the new file's path. Raises
+    OSError."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     copy = path.with_name(f"{path.name.split('.session')[0]}.{secrets.token_hex(4)}{RESCUED}")
     write_file(copy, b"".join(lines), replace=False)

@@ -1,14 +1,14 @@
-"""The state of a live session as the fold of its events: pure, without files, clock or device.
+"""The state of a live session, computed from its events: pure, without files, clock or device.
 
-`LiveSession.fold(study, header, events)` is the state after a log. A session that is resumed is folded event by event,
-each checked against the state before it (`replay.replayed`). Renderings are in the events: a fold computes no fit.
-`hilbo.session.log.transitions` has what each event does.
+`LiveSession.fold(study, header, events)` is the state after a log. A session that is resumed is computed event by
+event, each checked against the state before it (`replay.replayed`). Renderings are in the events, so no fit is
+computed. `hilbo.session.log.transitions` defines the effect of each event.
 
-Twice: the device's stops count while a rendering is on, of that rendering alone; what a person voids never counts. In
-a block that chooses, a rendering in which the device stopped twice is not proposed again: another one takes its place.
-In a planned block stops count for each planned trial, whatever other trials hold the same set; one that was stopped
-twice is put off to the end of its block, and asked there until it is answered, or until a person leaves it out
-(`skip`) or ends the session. So every block reaches its quota, but for what a person left out or ended.
+Stops of the device count while a rendering is on, for that rendering only; what a person voids never counts. After two
+stops: in a block that chooses its renderings, that rendering is not proposed again, and another one takes its place; in
+a planned block, where stops count per planned trial, the trial is put off to the end of its block, and asked there
+until it is answered, left out by a person (`skip`), or the session ends. So every block reaches its quota, except for
+what a person left out or ended.
 """
 
 from collections import Counter
@@ -31,7 +31,7 @@ Screen = Literal["wait", "trial", "ready", "rest", "paused", "done", "ended"]
 
 @dataclass(frozen=True)
 class LiveSession:
-    """The state of a session; made by `start`, `after` and `fold`."""
+    """The state of a session, immutable; created by `start`, `after` and `fold`."""
 
     study: StudyFile = field(repr=False)
     header: Header
@@ -52,7 +52,7 @@ class LiveSession:
 
     @classmethod
     def start(cls, study: StudyFile, header: Header) -> "LiveSession":
-        """A session before its first event. Raises InputError if the header belongs to another study."""
+        """State before the first event. Raises InputError if the header belongs to another study."""
         if header.study != study.hash:
             raise InputError(
                 f"this session belongs to a study of hash {header.study}, the study file has {study.hash}; use the file"
@@ -62,14 +62,15 @@ class LiveSession:
 
     @classmethod
     def fold(cls, study: StudyFile, header: Header, events: Iterable[Event]) -> "LiveSession":
-        """The state after these events."""
+        """State after these events, which are not checked beyond `after`. Raises InputError."""
         state = cls.start(study, header)
         for event in events:
             state = state.after(event)
         return state
 
     def after(self, event: Event) -> "LiveSession":
-        """The next state. Raises InputError for an event that does not follow, or of a kind that is not known."""
+        """Next state, after an event. Raises InputError for an event whose number does not follow, or of an unknown
+        kind."""
         if event.seq != self.seq + 1:
             raise InputError(f"event {event.seq} does not follow event {self.seq}; the log is not in order.")
         apply = APPLY.get(event.kind)
@@ -80,7 +81,8 @@ class LiveSession:
         return replace(following, seq=event.seq, began=began, last=event.time, **self._activity(event))
 
     def _activity(self, event: Event) -> dict[str, Any]:
-        """What an event of a presentation, or a response, changes: the last activity, and the pause before it."""
+        """Changed fields `active` and `pauses` after an event of a presentation or an answer; empty for other events. A
+        time of at least `PAUSE` since the last activity, with no step on, is recorded as a pause."""
         if event.kind not in ("stimulus", "answer"):
             return {}
         id = event.data["id"]
@@ -93,25 +95,26 @@ class LiveSession:
 
     @cached_property
     def pending(self) -> Trial | None:
-        """The trial that is being felt or asked about."""
+        """The trial that is being presented or waits for its answer; None if there is none."""
         return next((t for t in reversed(self.trials) if t.status == "pending"), None)
 
     def answers(self, block: int) -> list[Trial]:
-        """The trials of a block that count, in their order; repeats do not."""
+        """Answered trials of a block, in their order; without repetitions."""
         return [t for t in self.trials if t.block == block and t.status == "answered" and t.repeats is None]
 
     def counted(self, block: int) -> list[Trial]:
-        """The answers that fill a block: of a warm-up that came again those since then, else all."""
+        """The answered trials that count towards a block's quota: of a repeated warm-up only those since then."""
         after = self.again.trials if self.again is not None and self.again.block == block else 0
         return [t for t in self.answers(block) if t.id > after]
 
     def warm_up(self, block: int) -> int | None:
-        """The last warm-up among the blocks up to this one."""
+        """Index of the last warm-up among the blocks up to this one; None if there is none."""
         phases = [b.phase for b in self.header.blocks[: block + 1]]
         return max((i for i, phase in enumerate(phases) if phase == "warm-up"), default=None)
 
     def warms_up_again(self, at: float) -> bool:
-        """Whether the study has the warm-up again after the pause that lasts until the time `at` (s)."""
+        """Whether the study repeats the warm-up now, after a pause that lasts until the time `at` (s since the
+        epoch)."""
         after, here = self.study.session.warm_up_after_pause, self.block
         if after is None or here is None or self.active is None or self.screen not in ("trial", "wait"):
             return False
@@ -119,37 +122,39 @@ class LiveSession:
         return at - self.active >= after and not known and self.warm_up(here) is not None
 
     def quota(self, block: int) -> int:
-        """How many trials of a block are needed."""
+        """Number of answers that a block needs, including those added by "another one"."""
         return self.header.blocks[block].count + self.extra.get(block, 0)
 
     def stops(self, block: int) -> Counter[Any]:
-        """How often the device stopped while a rendering was on: by the place in the plan, or, in a block that
-        chooses, by the items of the rendering."""
+        """Number of stops while a rendering was on, by planned trial (index), or in a block that chooses by rendering
+        (items)."""
         voided = ((t, t.voided) for t in self.trials if t.block == block)
         return Counter(stop_key(t, side) for t, why in voided if why is not None for side in why["sides"])
 
     def excluded(self, block: int) -> list[dict[str, float]]:
-        """Renderings in which the device stopped twice, of a block that chooses them, those that stopped least often
-        first; they are not proposed again while there are others."""
+        """Renderings of a block that chooses, in which the device stopped twice or more, fewest stops first; empty for
+        a planned block. They are not proposed again while there are others."""
         if self.header.blocks[block].trials:
             return []
         return [dict(key) for key, count in sorted(self.stops(block).items(), key=itemgetter(1)) if count >= STOPS]
 
     def put_off(self, block: int) -> list[int]:
-        """Planned trials without an answer that the device stopped twice; they come last."""
+        """Indices of planned trials without an answer that the device stopped twice, and that come last in their block;
+        empty for a block that chooses."""
         if not self.header.blocks[block].trials:
             return []
         done = {t.planned for t in self.counted(block)} | set(self.skipped(block))
         return sorted(k for k, count in self.stops(block).items() if count >= STOPS and k not in done)
 
     def skipped(self, block: int) -> list[int]:
-        """Planned trials without an answer that a person left out."""
+        """Indices of planned trials that a person left out and that have no answer, sorted."""
         have = {t.planned for t in self.answers(block)}
         left_out = {t.planned for t in self.trials if t.block == block and t.status == "left out"}
         return sorted(k for k in left_out - have if k is not None)
 
     def _next_planned(self, block: int) -> int | None:
-        """The next planned trial without an answer; None where the block has enough, or none is left."""
+        """Index of the next planned trial without an answer, those put off last; None if the block has enough, or none
+        is left."""
         if len(self.counted(block)) >= self.quota(block):
             return None
         done = {t.planned for t in self.counted(block)} | set(self.skipped(block))
@@ -158,18 +163,19 @@ class LiveSession:
         return min(left, key=lambda i: (stops[i] if stops[i] >= STOPS else 0, i), default=None)
 
     def full(self, block: int) -> bool:
-        """Whether a block has all its answers, or nothing more to ask."""
+        """Whether a block has all its answers, or no more trials to ask."""
         if self.header.blocks[block].trials:
             return self._next_planned(block) is None
         return len(self.counted(block)) >= self.quota(block)
 
     @cached_property
     def block(self) -> int | None:
-        """The first block that is not full; None after the last."""
+        """Index of the first block that is not full; None after the last."""
         return next((i for i in range(len(self.header.blocks)) if not self.full(i)), None)
 
     def gate(self, block: int) -> Literal["ready", "rest"] | None:
-        """What stands before a block until somebody goes on: the end of a warm-up, or a rest."""
+        """Screen that is shown before a block until somebody continues: "ready" after a warm-up, "rest" before a block
+        with a rest; None for the first block, and once it was passed."""
         if block == 0 or block in self.passed:
             return None
         if self.again is not None and self.again.following == block:
@@ -180,7 +186,7 @@ class LiveSession:
 
     @cached_property
     def screen(self) -> Screen:
-        """What the participant has in front of them."""
+        """The screen that the participant page shows."""
         if self.aborted is not None:
             return "ended"
         if self.paused is not None:
@@ -195,7 +201,8 @@ class LiveSession:
 
     @cached_property
     def need(self) -> Need | None:
-        """What is to be proposed now; None while a trial is pending or nothing is to be asked."""
+        """What is to be proposed now, wanted repetitions first; None while a trial is pending or nothing is to be
+        asked."""
         if self.screen != "wait":
             return None
         warming = self.again is not None and self.again.block == self.block
@@ -207,44 +214,47 @@ class LiveSession:
         return Need(self.block, planned)
 
     def trial(self, id: int) -> Trial:
-        """The trial of this id. Raises RefusedError."""
+        """The trial with this id (from 1). Raises RefusedError if there is none."""
         if not 1 <= id <= len(self.trials):
             raise RefusedError("old-trial", f"there is no trial {id} in this session.")
         return self.trials[id - 1]
 
     def steps_of(self, trial: Trial) -> list[tuple[str, float]]:
-        """What is felt and for how many seconds; a and b in the order of this trial."""
+        """Steps of a trial: (what is shown, duration in s); a and b are swapped if b is presented first."""
         steps = protocol(self.study.session, self.header.blocks[trial.block].phase).steps
         other = {"a": "b", "b": "a"} if trial.first == "b" else {}
         return [(other.get(step.show, step.show), step.seconds) for step in steps]
 
     @cached_property
     def skippable(self) -> Trial | None:
-        """The trial that may be left out now."""
+        """The pending trial, if it may be left out (`actions.skip`): planned, and stopped twice; else None."""
         trial = self.pending
         good = trial is not None and trial.repeats is None and trial.planned in self.put_off(trial.block)
         return trial if good else None
 
     @cached_property
     def last_answered(self) -> Trial | None:
-        """The trial whose answer came last, of those that count: what `undo` takes back."""
+        """The trial that was answered last, among those that count, also repetitions: `undo` takes it back. None if
+        there is none."""
         given = [t for t in self.trials if t.status == "answered"]
         return max(given, key=lambda t: t.answered["seq"] if t.answered else 0, default=None)
 
     @cached_property
     def voidable(self) -> Trial | None:
-        """The trial that a person means who wants one void: the one being felt, or the newest answered one."""
+        """The trial that an experimenter's "void" refers to: the pending one if its presentation has begun, else the
+        newest answered one; None if there is neither."""
         if self.pending is not None and self.pending.step is not None:
             return self.pending
         return next((t for t in reversed(self.trials) if t.status == "answered"), None)
 
     def with_trial(self, id: int, **changes) -> "LiveSession":
-        """With one trial changed."""
+        """Copy of the state in which trial `id` has these fields changed."""
         trials = list(self.trials)
         trials[id - 1] = replace(trials[id - 1], **changes)
         return replace(self, trials=tuple(trials))
 
     def dropped(self) -> "LiveSession":
-        """Without the pending proposal: the answers that it was made from have changed. Repeats come from none."""
+        """Copy of the state without the pending proposal, since the answers that it was based on have changed; a
+        pending repetition stays."""
         trial = self.pending
         return self if trial is None or trial.repeats else self.with_trial(trial.id, status="dropped", on=None)

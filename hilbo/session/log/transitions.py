@@ -1,9 +1,11 @@
-"""What each event does to the state of a live session (`hilbo.session.log.state`).
+"""The effect of each event on the state of a live session: functions that take a `LiveSession` and return the next one.
 
-A trial in which the device holds, stops or is lost after it began is void, and is asked again; so is one in which a
-program that presents did not present what it was asked for, which counts as a stop (`missed`). A repeated, voided,
-undone or interrupted presentation starts from its first step, and so does one that a pause cut off. Whatever changes
-the answers drops a proposal that was made from the old ones. A repetition that was stopped twice is not asked again.
+`APPLY` has the function for each kind of event, called with state and event; an event's `data["id"]` is a trial.
+
+A trial in which the device holds, stops or is lost after it began is voided and asked again; so is one that a stimulus
+program did not present as requested (`missed`), which counts as a stop. A repeated, voided, undone, interrupted or
+paused presentation starts again from its first step. Whatever changes the answers drops a pending proposal that was
+made from the old ones. A repetition that was stopped twice is not asked again.
 """
 
 from dataclasses import replace
@@ -23,6 +25,7 @@ STOPS = 2
 
 
 def _proposed(state, event):
+    """Add the proposed trial; a repetition is removed from `wanted`."""
     data = event.data
     trial = Trial(
         data["id"], data["block"], data["trial"], data, event.time, planned=data["planned"], repeats=data["repeats"]
@@ -31,6 +34,7 @@ def _proposed(state, event):
 
 
 def _sent(state, event):
+    """Record that a side's rendering is in force; with a stimulus program, also the values that it confirmed."""
     trial = state.trial(event.data["id"])
     side = event.data["side"]
     state = state.with_trial(trial.id, sent={**trial.sent, side: event.data})
@@ -41,7 +45,8 @@ def _sent(state, event):
 
 
 def _stimulus(state, event):
-    """A step of the presentation begins or ends; a rendering counts as felt from then on, and step 0 starts anew."""
+    """A step of the presentation begins or ends. A rendering counts as presented from the beginning of its step; step 0
+    first resets which sides were presented."""
     trial, show = state.trial(event.data["id"]), event.data["show"]
     if not event.data["on"]:
         return state.with_trial(trial.id, on=None)
@@ -51,6 +56,7 @@ def _stimulus(state, event):
 
 
 def _answered(state, event):
+    """Set the trial to "answered", with its values, client, times and telemetry."""
     data = event.data
     facts = {"seq": event.seq, "time": event.time, "browser": data["browser"]}
     given = {"values": data["values"], "client": data["client"], "telemetry": data.get("telemetry")}
@@ -58,13 +64,14 @@ def _answered(state, event):
 
 
 def _without(wanted: tuple[int, ...], id: int | None) -> tuple[int, ...]:
-    """The trials to be felt once more without the first mention of one."""
+    """Copy of `wanted` without the first occurrence of `id`; unchanged if there is none."""
     place = wanted.index(id) if id in wanted else len(wanted)
     return wanted[:place] + wanted[place + 1 :]
 
 
 def _taken_out(state, trial, **changes):
-    """An answer, or a proposal, does not count any more: what was made from it goes, and it is not repeated."""
+    """Change a trial so that it no longer counts (`changes` of its fields). If it was answered, and is no repetition,
+    also drop the pending proposal, and pending or wanted repetitions of it."""
     state = state.with_trial(trial.id, on=None, **changes)
     if trial.status != "answered" or trial.repeats:
         return state
@@ -73,7 +80,7 @@ def _taken_out(state, trial, **changes):
 
 
 def _without_pending_repeat(state, id: int):
-    """The repetition of a trial that is being felt goes."""
+    """Drop the pending trial if it is a repetition of trial `id`."""
     pending = state.pending
     if pending is None or pending.repeats != id:
         return state
@@ -81,11 +88,12 @@ def _without_pending_repeat(state, id: int):
 
 
 def _counts(state, id: int) -> bool:
-    """Whether the answer to this trial counts."""
+    """Whether trial `id` has an answer that counts."""
     return state.trial(id).status == "answered"
 
 
 def _undone(state, event):
+    """Set the trial to "undone"; an undone repetition is wanted again, first, if the answer that it repeats counts."""
     trial = state.trial(event.data["id"])
     state = _taken_out(state, trial, status="undone")
     again = trial.repeats and _counts(state, trial.repeats)
@@ -93,10 +101,12 @@ def _undone(state, event):
 
 
 def _again(trial) -> dict[str, Any]:
+    """Changes of a trial's fields that restart its presentation from the first step."""
     return {"presentation": trial.presentation + 1, "step": None, "on": None, "felt": frozenset(), "confirmed": {}}
 
 
 def _repeated(state, event):
+    """Restart the trial if it is pending; else append it to `wanted`, the trials to be presented once more."""
     trial = state.trial(event.data["id"])
     if trial.status == "pending":
         return state.with_trial(trial.id, **_again(trial))
@@ -104,13 +114,18 @@ def _repeated(state, event):
 
 
 def stop_key(trial: Trial, side: str) -> Any:
-    """What a stop counts for."""
+    """Key under which `LiveSession.stops` counts a stop: a planned trial's index, else the items of the side's
+    rendering."""
     return tuple(trial.renderings[side].items()) if trial.planned is None else trial.planned
 
 
 def _made_void(state, trial, by, reason, sides=()):
-    """`sides`: the one that was on when the device stopped. `asked_again`: whether a repetition is. `beside`: the
-    answers to the same renderings that counted at that time; any other takes the place of this one."""
+    """Set the trial to "void" by "rule" or "experimenter"; a repetition is wanted again unless it was stopped twice.
+
+    `sides`: those that were on when the device stopped. Stored in `voided` with: `asked_again`, whether a repetition is
+    wanted again, and `beside`, the other answers to the same renderings that count now; a later one replaces this
+    trial.
+    """
     beside = [t.id for t in state.answers(trial.block) if t.id != trial.id and t.renderings == trial.renderings]
     voided = {"by": by, "reason": reason, "sides": list(sides), "beside": beside}
     state = _taken_out(state, trial, status="void", voided=voided)
@@ -124,15 +139,19 @@ def _made_void(state, trial, by, reason, sides=()):
 
 
 def _voided(state, event):
+    """Void the trial, as the experimenter requested."""
     return _made_void(state, state.trial(event.data["id"]), "experimenter", event.data["reason"])
 
 
 def _skipped(state, event):
+    """Set the trial to "left out"."""
     voided = {"by": "experimenter", "reason": event.data["reason"], "sides": []}
     return state.with_trial(event.data["id"], status="left out", on=None, voided=voided)
 
 
 def _restored(state, event):
+    """Set a voided trial to "answered" again. For a repetition, its replacement is no longer wanted, or is dropped if
+    pending; for any other trial the pending proposal is dropped."""
     trial = state.trial(event.data["id"])
     again, state = trial.voided, state.with_trial(trial.id, status="answered", voided=None)
     if not trial.repeats:
@@ -145,6 +164,7 @@ def _restored(state, event):
 
 
 def _paused(state, event):
+    """Begin a break; a presentation that is not complete will restart from its first step."""
     trial = state.pending
     if trial is not None and trial.unfinished:
         state = state.with_trial(trial.id, **_again(trial))
@@ -152,6 +172,8 @@ def _paused(state, event):
 
 
 def _device(state, event):
+    """Store the device's condition. With hold, estop or lost, void the trial (None: the pending one) if it had
+    begun."""
     data = event.data
     trial = state.pending if data["trial"] is None else state.trial(data["trial"])
     begun = trial is not None and trial.step is not None and trial.status in ("pending", "answered")
@@ -162,13 +184,14 @@ def _device(state, event):
 
 
 def _missed(state, event):
+    """Void the trial, by rule; counts as a stop of the side that was not presented."""
     trial = state.trial(event.data["id"])
     reason = f"stimulus: {event.data['reason']}"
     return _made_void(state, trial, "rule", reason, {event.data["show"]} & set(trial.renderings))
 
 
 def _warm_up_again(state, event):
-    """The pending proposal is made again after the warm-up, and so is a repetition."""
+    """Repeat the warm-up. The pending trial is dropped and will be proposed again after it; so will a repetition."""
     trial, block = state.pending, event.data["block"]
     if trial is not None:
         state = state.with_trial(trial.id, status="dropped", on=None)

@@ -30,19 +30,21 @@ Comparison = tuple[str, str, Side]
 
 
 def williams(n: int) -> Int[np.ndarray, "rows n"]:
-    """The orders of n treatments 0..n-1; for odd n the second half mirrors the first."""
+    """Williams design of n treatments 0..n-1, an order in each row: n rows for even n (and 1), 2n for odd n, whose
+    second half mirrors the first."""
     zigzag = [(k + 1) // 2 if k % 2 else (n - k // 2) % n for k in range(n)]
     square = (np.array(zigzag)[None, :] + np.arange(n)[:, None]) % n
     return square if n % 2 == 0 or n == 1 else np.concatenate([square, square[:, ::-1]])
 
 
 def block_size(n: int) -> int:
-    """How many participants make a complete block: the balance is exact at its multiples."""
+    """Number of participants in a complete block; the balance is exact for its multiples."""
     return len(williams(n))
 
 
 def orders(n: int, participants: int, seed: int) -> Int[np.ndarray, "participants n"]:
-    """An order of n treatments for each participant."""
+    """Random order of the treatments 0..n-1 for each participant, balanced by Williams designs; the same for the same
+    seed."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, n, 1]))
     square = williams(n)
     halves = np.split(square, len(square) // n)
@@ -55,11 +57,12 @@ def orders(n: int, participants: int, seed: int) -> Int[np.ndarray, "participant
 
 
 def comparisons(pairs: Sequence[tuple[str, str]], repeats: int, seed: int) -> list[Comparison]:
-    """Each pair `repeats` times, in rounds of all pairs, each round in a random order.
+    """Random sequence of comparisons: each pair of sets `repeats` times, in rounds of all pairs, the same for the same
+    seed.
 
-    Within each pair, the sides of its sets and which of them is felt first are balanced over every two rounds, and
-    over every four which side is felt first; what fewer rounds leave over is balanced between pairs, and over people,
-    because where a session begins in this cycle is drawn. No round begins with the pair that ended the last.
+    Within each pair, which set is on which side and which is felt first are balanced over every two rounds, and over
+    every four which side is felt first; what fewer rounds leave over is balanced between pairs, and over participants,
+    because the start of each session in this cycle is random. No round begins with the pair that ended the last.
     """
     rng = np.random.default_rng(np.random.SeedSequence([seed, len(pairs), repeats, 2]))
     begin = int(np.random.default_rng(np.random.SeedSequence([seed, len(pairs), repeats, 3])).integers(4))
@@ -79,8 +82,9 @@ def comparisons(pairs: Sequence[tuple[str, str]], repeats: int, seed: int) -> li
 
 
 def _ways(repeats, start, rng):
-    """(swapped, felt first) for each round: complementary ones two by two, all four over four; pairs that start
-    elsewhere have other leftovers."""
+    """For one pair, a list with (whether its sets are swapped, side felt first) for each of the `repeats` rounds.
+    `start`: where in the cycle of the four ways it begins; the two of a pair of rounds are complementary, in random
+    order by `rng`."""
     cycle = [_CYCLES[start % 4][i % 4] for i in range(repeats)]
     chunks = [cycle[i : i + 2] for i in range(0, repeats, 2)]
     return list(itertools.chain.from_iterable([chunk[j] for j in rng.permutation(len(chunk))] for chunk in chunks))

@@ -1,7 +1,7 @@
-"""participants.csv: who takes part, by pseudonymous id, apart from all answers.
+"""participants.csv: the participants by pseudonymous id, kept separately from all answers.
 
 Columns: participant, consent_time (ISO 8601), protocol_number, optional age and handedness; others are kept. Consent
-and the protocol's number must stand there before the first trial.
+and protocol number must be entered before the first trial.
 """
 
 import datetime
@@ -24,12 +24,12 @@ People = dict[str, dict[str, str]]
 
 
 def read_people(path: str | os.PathLike) -> People:
-    """participant -> row. Raises InputError with the line of what is wrong."""
+    """Read the list: participant -> row (column -> text). Raises InputError, with the line of the error."""
     return _read(path)[0]
 
 
 def _read(path: str | os.PathLike) -> tuple[People, str]:
-    """The people of a list, and its delimiter."""
+    """Read and check the list; return its rows by participant, and its delimiter. Raises InputError."""
     needs = f"a list of participants has {', '.join(_NEEDED)}"
     people: People = {}
     with open_csv(path, needs, fill=True) as table:
@@ -48,8 +48,11 @@ def _read(path: str | os.PathLike) -> tuple[People, str]:
 
 
 def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
-    """Add a row, and write the table anew, whole or not at all; with its folder. One hilbo after the other, and where
-    the path is a link, in the place that it leads to. Raises InputError."""
+    """Add a row, and rewrite the list atomically, under the lock of its folder; return all rows by participant.
+
+    List and folder are created if they do not exist; a link is followed. Raises InputError for a row that is not valid,
+    an id that is taken (also with other capitals), and a file that cannot be written.
+    """
     person = {key: str(value).strip() for key, value in row.items()}
     _check(person, str(path))
     _check_past(person, str(path))
@@ -72,7 +75,8 @@ def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
 
 
 def _place(path: Path) -> Path:
-    """Where a list lies. Behind a link it must be there: else a drive that is missing would get a list of its own."""
+    """Path of the list behind a link. Raises InputError for a link to a file that does not exist: a missing drive would
+    otherwise get a new list."""
     place = Path(os.path.realpath(path))
     if path.is_symlink() and not place.exists():
         raise InputError(f"{path}: is a link to {place}, where no list is; connect its drive, or remove the link.")
@@ -80,7 +84,9 @@ def _place(path: Path) -> Path:
 
 
 def check_consent(people: People, participant: str, protocol_number: str = "") -> dict[str, str]:
-    """The participant's row. Raises InputError without consent, or under another protocol than the study's."""
+    """Return the participant's row. Raises InputError if they are not in the list, consent time or protocol number
+    is missing, the consent is in the future, or the protocol is another one than `protocol_number` ("" is not
+    compared)."""
     if participant not in people:
         raise InputError(
             f'participant "{participant}" is not in the list of participants; add them, with the time of their consent.'
@@ -99,6 +105,8 @@ def check_consent(people: People, participant: str, protocol_number: str = "") -
 
 
 def _check(row, place):
+    """Raise InputError for a row with an id that is not pseudonymous, text that a spreadsheet would run as a formula,
+    or a consent_time, age or handedness that is not valid. `place` is for messages."""
     check_id(row.get("participant", ""), place)
     for name, text in row.items():
         check_text(name, "the name of a column", place)
@@ -117,7 +125,8 @@ def _check(row, place):
 
 
 def _check_past(row, place):
-    """Nobody has agreed tomorrow; a day is left, since a time without its zone may be of another one."""
+    """Raise InputError for a consent_time more than a day in the future: one without a zone may be of another time
+    zone."""
     if not row.get("consent_time"):
         return
     consent = datetime.datetime.fromisoformat(row["consent_time"])
@@ -126,6 +135,7 @@ def _check_past(row, place):
 
 
 def _write(path, people, delimiter):
+    """Rewrite the list, with the standard columns first."""
     columns = list(dict.fromkeys((*COLUMNS, *(key for row in people.values() for key in row))))
     rows = [[row.get(column, "") for column in columns] for row in people.values()]
     rewrite_file(path, csv_text([columns, *rows], delimiter))

@@ -1,12 +1,12 @@
-"""A study's sessions in advance: who is shown what, in which order, from one seed; to be registered before it begins.
+"""Plans of a study's sessions: what is shown to whom, in which order, from one seed; to be registered before it begins.
 
-`make_plan` gives the plan of a whole study, whose hash stands in every log, `planned_header` one session of it.
-Materials come in the orders of a Williams design, pairs balanced as `hilbo.session.plan.counterbalance` says.
+`make_plan` gives the plan of a whole study, whose hash is in every log, `planned_header` the header of one session.
+Materials come in the orders of a Williams design, pairs balanced as `hilbo.session.plan.counterbalance` describes.
 
-A validation compares best, mid and worst: of the population's map (`source` aggregate; for people who were not in it),
-or of each participant's own (individual; for these very people). An aggregate-best validation compares the population's
-optimum with every individual's own. Sets of individuals are called by a code that is made from their values alone, in
-plans, logs and tables: whoever withdraws leaves no id in the answers of others.
+A validation compares the sets best, mid and worst: of the population's map (`source` aggregate; for participants who
+were not in it), or of each participant's own (individual; for these same participants). An aggregate-best validation
+compares the population's optimum with every individual optimum. Individual sets are named by a code made from their
+values only, in plans, logs and tables: after a withdrawal no id is left in the answers of others.
 """
 
 from collections.abc import Mapping, Sequence
@@ -49,12 +49,13 @@ def make_plan(
     sets: Mapping[str, Sets] | None = None,
     source: Source | None = None,
 ) -> Plan:
-    """The plan of one kind of session for everybody.
+    """Plan one kind of session for all participants; the same for the same arguments. Nothing is written.
 
     **Arguments:** `materials`: all that each participant has, by default those of the study. `sets`: for validations
     material ("" for a study without) -> name of a set -> parameters; names are `best`, `mid` and `worst`, or with an
     individual source `PARTICIPANT best` and so on; for aggregate-best `aggregate` and `individual:PARTICIPANT`. The
-    plan has a code in the place of each PARTICIPANT in these names. Raises InputError.
+    plan has a code in place of each PARTICIPANT in these names. Raises InputError for ids, labels or sets that are not
+    valid.
     """
     if len(set(participants)) < len(participants) or not participants:
         raise InputError("plan: participants must be named, each once.")
@@ -90,7 +91,10 @@ def make_plan(
 
 
 def planned_header(plan: Plan, study: StudyFile, participant: str, **others: Any) -> Header:
-    """The header of a planned session. Raises InputError if plan, study and participant do not belong together."""
+    """Header of a participant's planned session. `others`: further fields of Header.
+
+    Raises InputError if the plan belongs to another study, or the participant is not in it.
+    """
     check_plan(plan, study)
     rows = {row.participant: row for row in plan.participants}
     if participant not in rows:
@@ -102,14 +106,17 @@ def planned_header(plan: Plan, study: StudyFile, participant: str, **others: Any
 
 
 def planned_by(plan: Plan, planned: Header, begun: Header) -> bool:
-    """Whether a session was begun by this plan, or by one that it replaces and with the same row; `planned` is what the
-    row gives today. Its label may be another."""
+    """Whether the session with the header `begun` follows this plan, or an earlier version of it, with the same row.
+
+    `planned`: header that the row gives now; another session label is no difference.
+    """
     known = begun.plan in (plan.hash, *plan.replaces)
     return known and planned_part(begun) == planned_part(replace(planned, session=begun.session))
 
 
 def check_plan(plan: Plan, study: StudyFile) -> None:
-    """Refuse a plan that belongs to another study, or has sessions that cannot be. Raises InputError."""
+    """Raise InputError for a plan of another study, or with a row whose header is not valid or of another
+    participant."""
     if plan.study != study.hash:
         raise InputError(
             f"the plan belongs to another study ({plan.study}, not {study.hash}); use the study file it was made from."
@@ -121,8 +128,12 @@ def check_plan(plan: Plan, study: StudyFile) -> None:
 
 
 def reissue(plan: Plan, dropped: str, new: str) -> Plan:
-    """The plan in which somebody new has the row (order, seed, sets) of a participant who dropped out. A row is given
-    away once. `replaces` keeps the hash that logs have. Raises InputError."""
+    """Copy of the plan with a row for `new`, with order, seed and sets of `dropped`, whose row stays; `replaces` gets
+    the hash of the old plan.
+
+    Raises InputError if `dropped` is not in the plan, `new` is, the row was reissued before, or its sets are
+    individual.
+    """
     check_id(new, "plan")
     rows = {row.participant: row for row in plan.participants}
     if dropped not in rows or new in rows:
@@ -138,15 +149,21 @@ def reissue(plan: Plan, dropped: str, new: str) -> Plan:
 
 
 def planned_part(header: Header) -> PlannedSession:
-    """The part of a header that a plan fixes."""
+    """The fields of a header that a plan fixes."""
     return PlannedSession(*(getattr(header, name) for name in PlannedSession.__struct_fields__))
 
 
 def _header_of_row(row: PlanRow) -> Header:
+    """Header of the session in a plan's row."""
     return Header(**msgspec.structs.asdict(row.header))
 
 
 def _header(study, person, session, seed, phase, materials, sets, source, codes) -> Header:
+    """Header of one participant's session: of optimisation, or of comparisons with the codes in the names of sets.
+
+    Arguments as in `make_plan`; `materials` in this participant's order, `codes`: participant -> code. Raises
+    InputError if the phase needs sets and lacks them.
+    """
     if phase == "optimisation":
         return header_for(study, person, session, seed, materials=materials)
     if phase == "warm-up" or sets is None:
@@ -167,7 +184,8 @@ def _header(study, person, session, seed, phase, materials, sets, source, codes)
 
 
 def _compared(study, person, phase, sets, source, codes, seed):
-    """A block's comparisons, and the names of the sets in it."""
+    """Comparisons of one block, (set a, set b, side felt first) each, and the list of the sets in it, by their names in
+    `sets`. Raises InputError if a set is missing."""
     repeats = protocol(study.session, phase).count
     if phase == "aggregate-best":
         others = sorted((name for name in sets if name.startswith(OWN)), key=lambda name: coded(name, codes))

@@ -1,8 +1,8 @@
-"""Names of people's own sets: a code in the place of the participant's id.
+"""Codes in place of participants' ids in the names of individual sets, and labels of renderings.
 
-Others compare these sets, and their answers name them. A code is made from the sets' values alone, so that it leads to
-nobody once the results are gone in which the values stand beside the id. And labels of renderings, for those who are
-to speak of them without knowing them.
+Other participants compare these sets, and their answers contain the names. A code is made from the sets' values only,
+so that it leads to nobody once the results are deleted in which values and id are together. Labels are for people who
+refer to renderings without knowing their parameters.
 """
 
 import json
@@ -21,15 +21,19 @@ Sets = Mapping[str, Mapping[str, float]]
 
 
 def code_of(values: Any, taken: Iterable[str] = ()) -> str:
-    """The code of some values; with a number behind it where another person has the same ones."""
+    """Code of a participant's `values`: "s" and 8 hex digits of their hash as JSON. If a code in `taken` has the same
+    digits, a number is appended ("-2", …)."""
     code = "s" + digest_of(json.dumps(values, sort_keys=True).encode())[:8]
     again = sum(other.partition("-")[0] == code for other in taken)
     return f"{code}-{again + 1}" if again else code
 
 
 def label_of(values: Mapping[str, Any], session: str) -> str:
-    """A label for a rendering (parameter -> value), the same whenever it comes again in a session: three letters and
-    two digits, which say nothing of the values. `session`: what makes another session's labels others."""
+    """Label of a rendering (parameter -> value): three letters and two digits from a hash, which tell nothing of the
+    values.
+
+    Equal renderings have equal labels within a `session`, and other labels in another one.
+    """
     number = int(digest_of(json.dumps([session, sorted(values.items())]).encode()), 16)
     letters = ""
     for _ in range(3):
@@ -39,7 +43,7 @@ def label_of(values: Mapping[str, Any], session: str) -> str:
 
 
 def set_codes(sets: Mapping[str, Sets]) -> dict[str, str]:
-    """Participant -> the code that stands for them in names of sets. `sets`: material -> name -> parameters."""
+    """Participant -> code, for all participants in the names of sets. `sets`: material -> name -> parameters."""
     values: dict[str, list[Any]] = {}
     for material, here in sets.items():
         for name, parameters in here.items():
@@ -53,7 +57,7 @@ def set_codes(sets: Mapping[str, Sets]) -> dict[str, str]:
 
 
 def coded(name: str, codes: Mapping[str, str]) -> str:
-    """The name of a set with the code in the place of the participant."""
+    """Name of a set with the participant's id replaced by their code; names of the population's sets are unchanged."""
     person = _person(name)
     if not person:
         return name
@@ -61,7 +65,8 @@ def coded(name: str, codes: Mapping[str, str]) -> str:
 
 
 def _person(name: str) -> str:
-    """Participant in the name of a set; "" for sets of the population."""
+    """Participant in the name of a set, `individual:PARTICIPANT` or `PARTICIPANT ROLE`; "" for sets of the
+    population."""
     if name.startswith(OWN):
         return name.removeprefix(OWN)
     before, _, role = name.rpartition(" ")

@@ -1,7 +1,7 @@
-"""The sets of a validation, from the results of an optimisation and the answers that these were made of.
+"""The sets of a validation, from the results of an optimisation and the answers that they were computed from.
 
-The map is fitted again from the answers, so that best, mid and worst are read from the very map, and must have its
-optimum where result.json has it: results of other answers, or of another study, are refused.
+The map is fitted again from the answers, so that best, mid and worst are read from the same map; its optimum must be
+that of result.json, or the results are of other answers or another study, and are refused.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,8 @@ NamedSets = dict[str, dict[str, float]]
 
 
 def check_participants(result: Result, participants: Sequence[str], source: Source) -> None:
-    """Validation of the aggregate needs people who are not in it, of individuals' own maps these very people."""
+    """Raise InputError for a participant whose answers are in the results although `source` is "aggregate", or are not
+    although it is "individual"."""
     in_map = {person.participant for person in result.participants}
     for person in participants:
         if source == "aggregate" and person in in_map:
@@ -47,7 +48,11 @@ def check_participants(result: Result, participants: Sequence[str], source: Sour
 def validation_sets(
     study: Study, result: Result, cohort: Cohort, source: Source, participants: Sequence[str]
 ) -> NamedSets:
-    """Best, mid and worst of the map, or of each participant's own (`PARTICIPANT best`): name -> parameters."""
+    """Compute the sets best, mid and worst of the population's map, or of each participant's own: name -> parameters.
+
+    Names are "best" or, with source "individual", "PARTICIPANT best". The maps are fitted from the answers in `cohort`
+    of the participants in the results. Raises InputError for another aggregation method or optimum than in the results.
+    """
     cohort = cohort.of([person.participant for person in result.participants])
     if result.rule not in (None, study.rule):
         raise InputError(
@@ -69,16 +74,24 @@ def validation_sets(
 
 
 class _Predict(eqx.Module):
+    """A participant's posterior as a function."""
+
     posterior: Any
 
     def __call__(self, x):
+        """Mean and variance of the latent score at the points x."""
         return self.posterior.predict(x)
 
 
 def aggregate_best_sets(study: Study, result: Result) -> NamedSets:
-    """The population's optimum and every individual's own."""
+    """Sets "aggregate", the population's optimum, and "individual:PARTICIPANT" for each individual optimum: name ->
+    parameters.
+
+    Raises InputError if the results have no individual optima, or one is outside of the study's ranges.
+    """
 
     def of(optimum: FoundOptimum, what: str) -> dict[str, float]:
+        """Parameters of an optimum, checked against the study's ranges; `what` names it in messages."""
         return check_values(optimum.parameters, study.space.parameters, "plan", what)
 
     sets = {"aggregate": of(result.optimum, "the optimum")}
@@ -90,11 +103,13 @@ def aggregate_best_sets(study: Study, result: Result) -> NamedSets:
 
 
 def _named(study, unit, prefix) -> NamedSets:
+    """Sets from three points of the unit cube, best, mid, worst: `prefix` and role -> parameters in physical units."""
     rows = np.asarray(study.space.to_physical(unit))
     return {prefix + name: Rendering.of(study.space, row).values for name, row in zip(_NAMES, rows, strict=True)}
 
 
 def _check_same(study, result, x):
+    """Raise InputError if the optimum x (d,), in the unit cube, is not that of the results."""
     stated = check_values(result.optimum.parameters, study.space.parameters, "plan", "the optimum")
     distance = np.max(np.abs(Rendering.of(study.space, stated).unit - x))
     if distance > _SAME:

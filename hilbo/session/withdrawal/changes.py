@@ -1,10 +1,10 @@
-"""What is left of a table, a plan and a command without a participant: nothing here changes a file.
+"""Tables, plans and commands without a participant: the functions compute new content and change no file.
 
-A set that was read from somebody's own map may have been compared by others. Where their answers name it, it stays, and
-its name and source have the pseudonym in the place of the id; where nobody's do, it goes. So do sets of their own map
-under a code that their own answers alone name. Names of sets have one of three forms, with a material before it or not:
-`individual:ID`, `ID ROLE`, and `own-ID` of simulated studies of earlier versions. Nothing else in a plan or a table is
-taken for a name: an id such as 1 or a is also a session's label, a number, or a side.
+A set from a participant's own map may have been compared by others. If their answers name it, it stays, and its name
+and source have the pseudonym in place of the id; otherwise it is deleted. So are sets of the participant's own map
+under a code that only their own answers name. Names of sets have one of three forms, with or without a material before
+it: `individual:ID`, `ID ROLE`, and `own-ID` of simulated studies of earlier versions. Nothing else in a plan or a table
+counts as a name: an id such as 1 or a may also be a session's label, a number, or a side.
 """
 
 import contextlib
@@ -53,13 +53,13 @@ class Cells(NamedTuple):
     delimiter: str = ","
 
     def named(self) -> Iterator[dict[str, str]]:
-        """The rows, column -> cell, without blanks around them."""
+        """Yield each row as column -> cell, without blanks around them; surplus cells are left out."""
         head = [name.strip() for name in self.head]
         return (dict(zip(head, (cell.strip() for cell in row), strict=False)) for row in self.rows)
 
 
 class Edited(NamedTuple):
-    """What is left of a table."""
+    """A table without a participant."""
 
     kept: list[int]
     """The rows that stay, by their number from 0."""
@@ -69,7 +69,7 @@ class Edited(NamedTuple):
 
 
 def read_table(path: Path) -> Cells | None:
-    """A CSV or Parquet table; None for what is none that can be read."""
+    """Read a CSV or Parquet table as text; None if the file is no table or cannot be read."""
     try:
         if path.suffix == ".parquet":
             from hilbo.study.formats.csv_file import read_cells
@@ -84,7 +84,8 @@ def read_table(path: Path) -> Cells | None:
 
 
 def table_content(path: Path, edited: Edited) -> bytes:
-    """A table's file without the rows that go. Of Parquet numbers stay the same bits."""
+    """Content of the file `path` with only the rows that stay; numbers in Parquet stay the same bits (the file is read
+    again)."""
     if path.suffix == ".parquet":
         import pandas as pd
 
@@ -98,12 +99,13 @@ def table_content(path: Path, edited: Edited) -> bytes:
 
 
 def named_sets(table: Cells) -> set[str]:
-    """All sets that a table names."""
+    """Names of all sets in a table's columns set_a, set_b and set_id."""
     return {cells[column] for cells in table.named() for column in _NAME_COLUMNS if cells.get(column)}
 
 
 def sets_of(tables: Iterable[Cells], participant: str, label: str) -> tuple[dict[str, str], set[str]]:
-    """Names of a participant's sets, and what they are called afterwards; and the sets that nobody else compared."""
+    """New names of a participant's sets (old name -> name with the pseudonym `label`), and the names of those sets that
+    no other participant compared."""
     tables, renamed, theirs, compared, coded = list(tables), {}, set(), set(), set()
     for cells in (cells for table in tables for cells in table.named()):
         names = {cells.get(column, "") for column in ("set_a", "set_b")} - {""}
@@ -125,7 +127,8 @@ def sets_of(tables: Iterable[Cells], participant: str, label: str) -> tuple[dict
 
 
 def _renamed_set(name: str, participant: str, label: str, materials: Iterable[str | None] = ()) -> str:
-    """The name of a set with a label in the place of the id; as it is, where it is not named after the participant."""
+    """Name of a set with `label` in place of the id; unchanged if the set is not named after the participant.
+    `materials`: those that may precede the name."""
     stated = [material for material in materials if material]
     for prefix in ("", *(f"{material} " for material in stated)):
         rest = name[len(prefix) :] if name.startswith(prefix) else ""
@@ -139,7 +142,8 @@ def _renamed_set(name: str, participant: str, label: str, materials: Iterable[st
 def without_person(
     table: Cells, participant: str, label: str, names: Mapping[str, str], sets_gone: Collection[str] = ()
 ) -> Edited:
-    """A table without a participant. `names`: sets that are called otherwise now. `sets_gone`: their rows go."""
+    """Remove a participant's rows from a table, and rename sets. `names`: old -> new name of a set; `sets_gone`: sets
+    whose rows are removed; `label`: pseudonym for the source `individual:ID`."""
     head, kept, rows, renamed = [name.strip() for name in table.head], [], [], 0
     called = {**names, OWN + participant: OWN + label}
     for number, (row, cells) in enumerate(zip(table.rows, table.named(), strict=True)):
@@ -155,14 +159,15 @@ def without_person(
 
 
 def _new_cell(cell: str, column: str, names: Mapping[str, str]) -> str:
-    """A whole cell that is the name of a set, called otherwise; a and b are sides where a side stands."""
+    """Cell with the new name of a set, if its column has sets and the whole cell is a name in `names`; else unchanged.
+    "a" and "b" in the columns first and preferred are sides."""
     side = column in ("first", "preferred") and cell.strip() in ("a", "b")
     return cell if column not in _SET_COLUMNS or side else names.get(cell.strip(), cell)
 
 
 def plan_without(content: bytes, participant: str, label: str) -> str | None:
-    """A plan with a label in the place of a participant, and another hash; `replaces` keeps the one that logs have. A
-    session of their own sets goes. None where a file is no plan, or has nothing of theirs."""
+    """Text of a plan with `label` in place of a participant, a new hash, and the old one in `replaces`. With individual
+    sets the participant's row is removed. None if the content is no plan, or has nothing of theirs."""
     plan = plan_in(content)
     if plan is None or not any(participant in (row.participant, row.reissued_from) for row in plan.participants):
         return None
@@ -176,12 +181,14 @@ def plan_without(content: bytes, participant: str, label: str) -> str | None:
 
 
 def _row_without(row: PlanRow, participant: str, label: str, materials: Sequence[str | None]) -> PlanRow:
-    """A plan's row with the label where the participant is named, and in names of sets from their map."""
+    """Copy of a plan's row with `label` in place of the participant, also in names of sets from their map."""
 
     def set_name(name: str) -> str:
+        """Name of a set with the label in place of the participant."""
         return _renamed_set(name, participant, label, materials)
 
     def trial(planned: Planned) -> Planned:
+        """Planned trial with the new names of its sets."""
         return replace(planned, a=set_name(planned.a), b=None if planned.b is None else set_name(planned.b))
 
     names = {participant: label}
@@ -196,7 +203,8 @@ def _row_without(row: PlanRow, participant: str, label: str, materials: Sequence
 
 
 def command_without(command: str, participant: str) -> str:
-    """A command without a participant among those whom it names; empty if it names nobody else."""
+    """Command without the participant in its options --names and --participants; "" if such an option names nobody
+    else. Commands whose --participants is a number are changed in --names only."""
     words, kept = command.split(), []
     with contextlib.suppress(ValueError):  # a list that somebody changed
         words = shlex.split(command)

@@ -1,4 +1,4 @@
-"""What a withdrawal leaves below a folder that names the participant, or may, and why."""
+"""The files below a folder that still name a participant after a withdrawal, or may, and why they stay."""
 
 import contextlib
 from collections.abc import Iterable
@@ -18,12 +18,13 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".gif")
 
 
 def ending(files: Iterable[Path], *ends: str) -> list[Path]:
-    """The files whose names end so."""
+    """The files whose names end in one of `ends`."""
     return [path for path in files if path.name.endswith(ends)]
 
 
 def logs(files: Iterable[Path]) -> tuple[dict[Path, str], list[Path]]:
-    """Whose each log is, also under another name, and the logs that cannot be read."""
+    """Find the logs among the files, also under other names: path -> participant, and the list of those that cannot be
+    read."""
     whose, damaged = {}, []
     for path in (path for path in files if path.name.endswith(".session.jsonl") or is_log(path)):
         try:
@@ -34,7 +35,7 @@ def logs(files: Iterable[Path]) -> tuple[dict[Path, str], list[Path]]:
 
 
 def left_below(root: Path, participant: str) -> dict[str, str]:
-    """The files that name somebody, or may, and why they stay."""
+    """Search a folder for files that name a participant, or may: path -> reason why the file stays, as a predicate."""
     below = files_below(root)
     whose, damaged = logs(below.files)
     left = below.left | {str(path): "is a log that cannot be read; if it is theirs, delete it" for path in damaged}
@@ -51,7 +52,10 @@ def left_below(root: Path, participant: str) -> dict[str, str]:
 
 
 def _why_left(path: Path, participant: str, ours: bool, owner: str | None) -> str:
-    """Why a file is to be looked at; empty if it is not. `ours`: a file of results. `owner`: of a log."""
+    """Reason why a file needs the user's attention, as a predicate; "" if it does not. Reads the file.
+
+    `ours`: it is one of hilbo's results; `owner`: participant of the log that it is, None for other files.
+    """
     if not ours and owner is None and called_after(path, participant):
         return "is called after them and is no file that hilbo changes; look at it yourself"
     try:
@@ -73,11 +77,13 @@ def _why_left(path: Path, participant: str, ours: bool, owner: str | None) -> st
 
 
 def _as_csv(table: Cells) -> str:
+    """CSV text of a table."""
     return table_content(Path("table.csv"), Edited([], table, 0)).decode()
 
 
 def _holds_coded(path: Path) -> bool:
-    """Whether a file has renderings of individuals' maps that others compare under codes."""
+    """Whether a file names individual sets under codes, as other participants compare them; False if it cannot be
+    read."""
     if path.suffix == ".parquet":
         table = read_table(path)
         return table is not None and any(CODED_JUDGED.search(name) for name in named_sets(table))

@@ -1,7 +1,8 @@
-"""Results of a study from which somebody withdraws: what was computed with their answers, and what makes it again.
+"""Results of a study that a withdrawal affects: files that were computed with the participant's answers, and the
+commands that compute them again.
 
-A results folder is known by its list (`hilbo.study.results.listing`). Tables that were put or exported there are no
-results: they stay, without the participant.
+A results folder is recognised by its list (`hilbo.study.results.listing`). Tables that were put or exported there are
+not computed: they stay, without the participant.
 """
 
 import contextlib
@@ -31,8 +32,11 @@ def results_folders(files: Iterable[Path]) -> list[Path]:
 
 
 def computed(folder: Path, participant: str, files: Iterable[Path]) -> list[Path]:
-    """What was computed of results that were made with somebody's answers, as far as anything of them tells: they name
-    them, or are of `hilbo validate`, or of an earlier version that does not say what made them."""
+    """Files in a results folder that were computed with a participant's answers, as far as can be known; else empty.
+
+    All computed files count if any of the results, or the command that made them, names the participant, or if the
+    command is `hilbo validate` or not recorded.
+    """
     results, there = listed(folder), set(files)
     ours = [(name, folder / name) for name in results.files if folder / name in there]
     computed = [path for name, path in ours if not _is_data(name, _EXPORT in results.files)]
@@ -44,11 +48,13 @@ def computed(folder: Path, participant: str, files: Iterable[Path]) -> list[Path
 
 
 def _is_data(name: str, exported: bool) -> bool:
-    """Whether a file of results is a table, a log or a study file: of an export all but netCDF."""
+    """Whether a file of results is data, not computed: a table, log, plan or study file; of an export (`exported`) all
+    but netCDF."""
     return not name.endswith(".nc") if exported else _DATA.fullmatch(name.rpartition("/")[2]) is not None
 
 
 def _names(path: Path, participant: str) -> bool:
+    """Whether a text file of results names the participant, by exactly this id; True if it cannot be read."""
     try:
         return path.suffix in _TEXTS and bool(spelled(read_text(path), path.suffix, participant, exact=True))
     except OSError:
@@ -56,8 +62,12 @@ def _names(path: Path, participant: str) -> bool:
 
 
 def commands_of(folder: Path, participant: str, go: set[Path], files: Iterable[Path]) -> list[str]:
-    """What makes results again: the report of each folder in them that holds its own tables, else the command that was
-    given, without the participant; nothing where it was about nobody else."""
+    """Commands that compute results again: `hilbo report` for each folder in them that has its own tables, else the
+    recorded command without the participant; empty if it concerned nobody else.
+
+    `go`: files that are deleted; `files`: all files. For results without a record it is a sentence in place of a
+    command.
+    """
     results, stay = listed(folder), [path for path in files if folder in path.parents and path not in go]
     own = [path.parent for path in stay if path.name == "trials.csv" and path.with_name("study.toml") in stay]
     if own and _EXPORT not in results.files:
@@ -74,7 +84,8 @@ def commands_of(folder: Path, participant: str, go: set[Path], files: Iterable[P
 
 
 def list_again(folder: Path, participant: str, changed: set[Path]) -> None:
-    """The list of a results folder without what went; the folder goes too if nothing is left in it."""
+    """Rewrite the list of a results folder without deleted files, with new digests for `changed` ones (real paths), and
+    the command without the participant. Deletes empty folders below, and the list and the folder if no file is left."""
     known = listed(folder)
     files = {name: was for name, was in known.files.items() if (folder / name).is_file()}
     files = {

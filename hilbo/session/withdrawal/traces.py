@@ -1,8 +1,8 @@
-"""Where the files below a folder name a participant, also by an id that a spreadsheet or a person spelled otherwise.
+"""Search of the files below a folder for a participant's id, also as a spreadsheet or a person may have changed it.
 
-Links are followed within the folder and not out of it: what lies elsewhere may be another study's. A place that is not
-looked into is never passed over in silence; each has its reason. An id that is a number names somebody only where ids
-stand: in columns and fields of ids, after a word such as participant, in names of sets.
+Links are followed within the folder but not out of it, since what they lead to may belong to another study. Every place
+that is not searched is reported with its reason. An id that is a number counts only where ids are expected: in columns
+and fields of ids, after a word such as participant, in names of sets.
 """
 
 import csv
@@ -42,7 +42,7 @@ _PICTURE = re.compile(r"base64,[A-Za-z0-9+/=\s]+")
 
 
 class Below(NamedTuple):
-    """What lies below a folder."""
+    """Result of `files_below`."""
 
     files: list[Path]
     """Files, and links to files within the folder."""
@@ -53,10 +53,14 @@ class Below(NamedTuple):
 
 
 def files_below(root: Path) -> Below:
-    """Everything below a folder, the links within it among them, but for locks and a withdrawal's journal."""
+    """List all files below a folder, including links within it, except locks and a withdrawal's journal.
+
+    Folders of version control, links out of the folder and places that cannot be opened are not searched, but reported.
+    """
     inside, below = Path(os.path.realpath(root)), Below([], {}, {})
 
     def refused(error: OSError) -> None:
+        """Report a folder that cannot be opened."""
         below.left[str(error.filename)] = (
             f"cannot be opened ({error.strerror}); if it holds anything of theirs, delete it"
         )
@@ -72,7 +76,8 @@ def files_below(root: Path) -> Below:
 
 
 def _sort_in(path: Path, inside: Path, below: Below) -> None:
-    """Put one entry of a folder where it belongs; folders themselves, pipes and sockets hold no text."""
+    """Add one entry of a folder to `below`: as a file, a link, or a place that is not searched. `inside`: the real path
+    of the folder. Folders, pipes and sockets are skipped."""
     linked = os.path.islink(path)
     try:
         mode = path.stat().st_mode
@@ -91,18 +96,19 @@ def _sort_in(path: Path, inside: Path, below: Below) -> None:
 
 
 def same_id(text: str, participant: str) -> bool:
-    """Whether two ids are the same but for leading zeros, a decimal point with zeros, blanks, capitals and the form of
-    their Unicode: what spreadsheets and people change."""
+    """Whether two ids are equal apart from leading zeros, ".0", blanks, capitals and Unicode form, which spreadsheets
+    and people change."""
     return _form(text) == _form(participant)
 
 
 def _form(text: str) -> str:
+    """Normal form of an id for `same_id`: without blanks and leading zeros, lower case, NFKC."""
     text = re.sub(r"\s+", "", unicodedata.normalize("NFKC", text)).casefold()
     return re.sub(r"(?<=\d)\.0+(?!\d)", "", re.sub(r"(?<![\d.])0+(?=\d)", "", text))
 
 
 def _way(participant: str, exact: bool) -> str:
-    """A pattern of an id: as it is, or in all ways in which it may be spelled."""
+    """Regular expression of an id: of exactly this text, or of all spellings that `same_id` accepts."""
     if exact:
         return re.escape(participant)
     pieces = re.findall(r"\.\d+|\d+|.", _form(participant))
@@ -111,19 +117,21 @@ def _way(participant: str, exact: bool) -> str:
 
 
 def called_after(path: Path, participant: str) -> bool:
-    """Whether a file's name has this id as one of its parts."""
+    """Whether a file's name contains exactly this id, delimited by other characters than letters and digits."""
     return re.search(rf"(?<![A-Za-z0-9]){re.escape(participant)}(?![A-Za-z0-9])", path.stem) is not None
 
 
 def read_text(path: Path) -> str:
-    """A file's text, whatever can be read of it. Raises OSError."""
+    """Read a file as UTF-8, or UTF-16 with a byte order mark; bytes that cannot be decoded are replaced. Raises
+    OSError."""
     content = path.read_bytes()
     return content.decode(_BYTE_ORDER.get(content[:2], "utf-8"), "replace")
 
 
 def spelled(text: str, suffix: str, participant: str, exact: bool = False) -> str:
-    """How the text of a file with this suffix names somebody; empty if it does not. `exact`: by this id and no other
-    spelling of it."""
+    """The first occurrence of a participant's id in a file's text, as it is spelled there (perhaps with the words
+    around it); "" if there is none. `suffix`: the file's, which decides where a numeric id is looked for. `exact`: only
+    this spelling."""
     text, way = _PICTURE.sub("", text), _way(participant, exact)
     text = text if exact else unicodedata.normalize("NFKC", text)
     match = re.search(rf"(?:(?<![\w.-])|(?<=\bown-)){way}(?![\w-]|\.\w)", text)
@@ -145,7 +153,8 @@ def spelled(text: str, suffix: str, participant: str, exact: bool = False) -> st
 
 
 def _in_columns(text: str, is_id: Callable[[str], bool], delimiter: str) -> str:
-    """A whole cell of a column of ids that is this id."""
+    """First cell in a column of ids that is this id, in a CSV text with this delimiter; "" if there is none, or it is
+    no CSV."""
     try:
         reader = csv.reader(io.StringIO(text.lstrip("\ufeff")), delimiter=delimiter, skipinitialspace=True)
         rows = [row for row in reader if any(row)]
@@ -157,9 +166,12 @@ def _in_columns(text: str, is_id: Callable[[str], bool], delimiter: str) -> str:
 
 
 def _in_fields(text: str, is_id: Callable[[str], bool], participant: str) -> str:
-    """A field of ids of a JSON text, or one of a list of ids, that is this id; the id itself where nobody can tell."""
+    """First value (or key) in a field of ids of a JSON text that is this id; "" if there is none. If the text is no
+    JSON, the id itself is returned, since it cannot be excluded."""
 
     def named(value: Any, field: re.Match[str] | None) -> Iterator[str]:
+        """Yield the ids within `value` that match; `field` is the match of the name of its field, None for other
+        fields."""
         if isinstance(value, dict):
             for key, part in value.items():
                 yield from [key] if field and is_id(key) else []
@@ -177,7 +189,7 @@ def _in_fields(text: str, is_id: Callable[[str], bool], participant: str) -> str
 
 
 def is_closed(path: Path) -> bool:
-    """Whether a file is packed or compressed, so that no id is found in it: by how it begins, or by its name. Raises
+    """Whether a file is packed or compressed, so that no id can be found in it, by its first bytes or its name. Raises
     OSError."""
     with path.open("rb") as file:
         begin = file.read(20)

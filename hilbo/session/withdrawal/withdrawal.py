@@ -1,10 +1,10 @@
-"""Somebody withdraws from a study: what of theirs goes, what gets a pseudonym, what is made again, what is left.
+"""Withdrawal of a participant from a study: what is deleted, pseudonymised, to be computed again, and what is left.
 
-`delete_participant` holds the lock of the folder from the first look to the last change. What is to be done is decided
-before anything is changed and stands in a journal, which is deleted last: a withdrawal that was killed is given again
-and ends as an unbroken one would, with the same pseudonym and the same sentences. Until then no other command changes
-anything below the folder. What is not touched is listed: a log of somebody else, which is chained and theirs, even
-where it names a set of the one who withdraws; files that are not hilbo's; ids that are spelled otherwise.
+`delete_participant` locks the folder throughout. Everything is decided before anything is changed, and written to a
+journal, which is deleted last: after an interruption the command is given again and ends as it would have, with the
+same pseudonym and the same messages. Until then no other command changes anything below the folder. What is not changed
+is listed: logs of other participants, which are chained, even where they name a set of this one; files that are not
+hilbo's; ids that are spelled differently.
 """
 
 import contextlib
@@ -45,7 +45,8 @@ _HEAD = 2**12  # bytes of a table's first line
 
 
 class Withdrawal(msgspec.Struct):
-    """What a withdrawal does, and what it leaves; files by their path from the folder's own."""
+    """What a withdrawal does, and what it leaves. Files are paths relative to the folder in a plan of the withdrawal,
+    and full paths once done."""
 
     participant: str
     label: str = msgspec.field(default_factory=lambda: f"withdrawn-{secrets.token_hex(3)}")
@@ -69,16 +70,17 @@ class Withdrawal(msgspec.Struct):
 
     @property
     def begun(self) -> bool:
-        """Whether anything may have been changed."""
+        """Whether this is a plan with any changes, of which some may have been made."""
         return bool(self.files or self.removed or self.renamed)
 
 
 def delete_participant(folder: str | os.PathLike, participant: str, done: Withdrawal | None = None) -> Withdrawal:
-    """Remove one participant from everything below a folder. Raises InputError if nothing of theirs is there, one of
-    their sessions is running, results are being made, or a file could not be changed: all else is done then, and the
-    command is to be given again.
+    """Remove one participant from everything below a folder, and return what was done and left.
 
-    `done` is filled on the way, so that who gave it can say what was done if something unforeseen ends it."""
+    Deletes and rewrites files. Raises InputError if nothing of theirs is there, one of their sessions is running,
+    results are being computed, or a file could not be changed: all else is done then, and the command is to be given
+    again. `done` is filled on the way, so that the caller can report what was done even after an error.
+    """
     root, done = Path(folder), Withdrawal(participant) if done is None else done
     if not participant.strip():
         raise InputError("participants delete: give the id of the participant.")
@@ -116,7 +118,8 @@ def delete_participant(folder: str | os.PathLike, participant: str, done: Withdr
 
 
 def _journal(root: Path, participant: str) -> Withdrawal:
-    """That of a withdrawal that was interrupted, or a new one."""
+    """Read the journal of an interrupted withdrawal, or write and return a new one. Raises InputError if it cannot be
+    read or is another participant's, or a withdrawal was interrupted in a folder above."""
     path = root / JOURNAL
     if above := withdrawal_above(Path(os.path.realpath(root)).parent):
         raise InputError(f"{above}: a withdrawal was interrupted there; give its command again first.")
@@ -136,6 +139,7 @@ def _journal(root: Path, participant: str) -> Withdrawal:
 
 
 def _write_journal(root: Path, content: Withdrawal) -> None:
+    """Write the journal atomically. Raises InputError if it cannot be written."""
     try:
         write_file(root / JOURNAL, msgspec.json.encode(content), replace=True)
     except OSError as error:
@@ -143,8 +147,9 @@ def _write_journal(root: Path, content: Withdrawal) -> None:
 
 
 def _wait_for_others(root: Path, locks: contextlib.ExitStack) -> None:
-    """Hold the locks of the folders below that others may be changing, and deal with what killed commands left there.
-    Raises InputError."""
+    """Lock the folders below that other commands may be changing (the locks are added to `locks`), and clear up what
+    killed commands left there. Raises InputError if one is not free in time, results are being computed, or another
+    withdrawal was interrupted below."""
     inside, leftovers, places = Path(os.path.realpath(root)), [root], set()
     for place, folders, names in os.walk(root):
         if Path(place) != root and JOURNAL in names:
@@ -165,7 +170,8 @@ def _wait_for_others(root: Path, locks: contextlib.ExitStack) -> None:
 
 
 def _is_shared(path: Path) -> bool:
-    """Whether a file is one that several commands read and write again: a list of participants, or a plan."""
+    """Whether a file is one that several commands rewrite: a list of participants, or a plan. False if it cannot be
+    read."""
     try:
         with path.open("rb") as file:
             return (path.suffix == ".csv" and b"consent_time" in file.readline(_HEAD)) or (
@@ -179,8 +185,8 @@ def _is_shared(path: Path) -> bool:
 
 
 def _planned(root: Path, before: Withdrawal) -> Withdrawal:
-    """Everything that is to be done, and that was to be done when the withdrawal was interrupted. Raises InputError
-    where one of their sessions is running."""
+    """Plan all changes, including those of the interrupted withdrawal `before`; changes nothing. Raises InputError if
+    one of the participant's sessions is running."""
     below, person = files_below(root), before.participant
     whose, _ = logs(below.files)
     theirs = [path for path, name in whose.items() if name == person]
@@ -218,18 +224,23 @@ def _planned(root: Path, before: Withdrawal) -> Withdrawal:
 
 
 def _name(root: Path, path: Path) -> str:
+    """Path relative to the folder `root`, with slashes."""
     return path.relative_to(root).as_posix()
 
 
 def _keys(files: Iterable[Path], participant: str, whose: dict[Path, str]) -> list[Path]:
-    """The files of keys of one participant's sessions: those beside their logs, and those without a log that begin with
-    the id (.ID_SESSION.keys, of earlier versions .ID-SESSION.keys), not with a longer one of somebody else."""
+    """Files of browser keys of one participant's sessions. `whose`: log -> participant.
+
+    They are those next to their logs, and those without a log whose name begins with the id (.ID_SESSION.keys, in
+    earlier versions .ID-SESSION.keys) and not with a longer id of another participant.
+    """
     beside = {keys_path(path): person for path, person in whose.items()}
     begins = (f".{participant}_", f".{participant}-")
     others = {f".{person}{mark}" for person in whose.values() for mark in "_-"}
     longer = tuple(name for name in others if name.startswith(begins) and name not in begins)
 
     def theirs(path: Path) -> bool:
+        """Whether a file of keys belongs to the participant."""
         person = beside.get(path.with_name(path.name.removesuffix(".part")))
         if person is not None:
             return person == participant
@@ -239,7 +250,7 @@ def _keys(files: Iterable[Path], participant: str, whose: dict[Path, str]) -> li
 
 
 def _tables(below: Below, go: set[Path]) -> dict[Path, Cells]:
-    """The tables that stay, each once, whatever leads to it."""
+    """Read the tables that stay, each once even if links lead to it: path -> cells. `go`: files that are deleted."""
     paths = [path for path in ending(below.files, ".csv", ".parquet") if path not in go]
     places = {path.resolve() for path in paths if path not in below.links}
     paths = [path for path in paths if below.links.get(path) not in places]
@@ -247,6 +258,7 @@ def _tables(below: Below, go: set[Path]) -> dict[Path, Cells]:
 
 
 def _plan(path: Path, planned: Withdrawal) -> str | None:
+    """Text of a plan's file without the participant; None if it is no plan, does not name them, or cannot be read."""
     try:
         return plan_without(path.read_bytes(), planned.participant, planned.label)
     except OSError:  # which will be said
@@ -257,7 +269,8 @@ def _plan(path: Path, planned: Withdrawal) -> str | None:
 
 
 def _carry_out(root: Path, planned: Withdrawal, done: Withdrawal) -> dict[str, str]:
-    """Do what is planned, of which some may be done already. Returns what the system refused: file -> why."""
+    """Make the planned changes, of which some may have been made before; fill `done`. Returns path -> reason for each
+    file that could not be changed."""
     refused: dict[str, str] = {}
     for name in planned.files:
         with _refusals(root / name, refused):
@@ -278,7 +291,8 @@ def _carry_out(root: Path, planned: Withdrawal, done: Withdrawal) -> dict[str, s
 
 @contextlib.contextmanager
 def _refusals(path: Path, refused: dict[str, str]) -> Iterator[None]:
-    """What the system refuses about one file is listed, and the rest of a withdrawal goes on."""
+    """Context: catch an OSError about the file `path` and add its reason to `refused`, so that the withdrawal
+    continues."""
     try:
         yield
     except OSError as error:
@@ -287,13 +301,15 @@ def _refusals(path: Path, refused: dict[str, str]) -> Iterator[None]:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file; where it is a link, the file itself first, so that what cannot be removed is still found."""
+    """Delete a file if it exists; for a link first its target, so that a target that cannot be deleted is still
+    found."""
     path.resolve().unlink(missing_ok=True)
     path.unlink(missing_ok=True)
 
 
 def _rewrite(path: Path, planned: Withdrawal) -> None:
-    """A table or a plan without the participant; as it is, where that has been done."""
+    """Rewrite a table or a plan without the participant; a file that is done already stays unchanged. Deletes an
+    optional table of a report that has no rows left. Raises OSError."""
     if path.suffix == ".json":
         if (text := _plan(path, planned)) is not None:
             rewrite_file(path.resolve(), text)
