@@ -156,7 +156,7 @@ class Link:
         self._end_beats()
         return failures.deserted(why)
 
-    def _ask(self, frame, expected) -> Message:
+    def _ask(self, frame: bytes, expected: tuple[int, int, type]) -> Message:
         """Send a frame up to `tries` times and return the `expected` answer (sequence number, request code, class), or
         None if none came. Raises `DeviceError` if the line is lost."""
         with self._news:
@@ -355,7 +355,7 @@ class Link:
         elif isinstance(message, Nack) and message.reason == NackReason.STALE:
             self.stops = message.ticks
 
-    def _give(self, seq, message) -> None:
+    def _give(self, seq: int, message: Message) -> None:
         """Deliver an answer to the waiting request; one that does not match is dropped and counted in `stray`."""
         with self._news:
             if self._expected is not None and self._answer is None and _fits(seq, message, self._expected):

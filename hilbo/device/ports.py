@@ -121,7 +121,7 @@ def list_ports() -> list[PortInfo]:
     return [PortInfo(port.device, port.description or "") for port in sorted(comports())]
 
 
-def _connected(where):
+def _connected(where: str) -> SocketPort:
     """Connect to `where`, socket://HOST:PORT, within 3 s. Raises `InputError` for a bad address or a failed
     connection."""
     host, separator, number = where.removeprefix("socket://").rpartition(":")
@@ -136,7 +136,7 @@ def _connected(where):
     return SocketPort(connected, where)
 
 
-def _opened(name, baud):
+def _opened(name: str, baud: int) -> Any:
     """Open a serial port exclusively by pyserial, and return its object. Raises `InputError` if it cannot be opened."""
     try:
         import serial
@@ -149,7 +149,7 @@ def _opened(name, baud):
         raise InputError(_why_not(name, baud, error)) from error
 
 
-def _why_not(name, baud, error) -> str:
+def _why_not(name: str, baud: int, error: Exception) -> str:
     """Sentence for a serial port that cannot be opened because of `error`: the cause and what to do."""
     number = getattr(error, "errno", None)
     if number in _BUSY or "exclusively lock" in str(error):

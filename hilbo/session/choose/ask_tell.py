@@ -203,7 +203,7 @@ def _read_only(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
     return arrays
 
 
-def _asked(session) -> np.ndarray:
+def _asked(session: Session) -> np.ndarray:
     """The proposal (d,) of a session. Raises `InputError` once all trials are answered."""
     if session.proposal is None:
         raise InputError(

@@ -160,7 +160,7 @@ def _distances(
 
 
 def _rows(study: Study, points: Points) -> Float[np.ndarray, "n d"]:
-    """Points as an array, with d columns also if there are none."""
+    """Points in physical units as an array, which has d columns even if there are no points."""
     return np.array(points, float).reshape(-1, study.space.dim)
 
 

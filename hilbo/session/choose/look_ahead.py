@@ -139,7 +139,8 @@ class LiveChooser:
         return self._sessions[self._blocks[block].material]
 
     def _of_plan(self, material: str | None, planned: Planned) -> dict[str, Any]:
-        """Data of the proposal of a planned trial."""
+        """Data of the proposal of a planned trial: `renderings`, `sets`, `first`, and `choice` with the passivity
+        margins."""
         sides = {"a": planned.a} if planned.b is None else {"a": planned.a, "b": planned.b}
         renderings = {side: self._planned[material, id] for side, id in sides.items()}
         return {

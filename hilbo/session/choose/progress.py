@@ -29,7 +29,8 @@ __all__ = ["Consistency", "Trust", "consistency", "trust", "trust_of"]
 
 @dataclass(frozen=True)
 class Trust:
-    """Estimate of the best rendering after the answers so far (physical units)."""
+    """Estimate of the best rendering after the answers so far: parameter -> value in physical units, and how certain it
+    is."""
 
     best: dict[str, float]
     top: float
@@ -40,7 +41,8 @@ class Trust:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Answers to renderings that were felt twice: how many pairs, how many alike, mean distance in categories."""
+    """Agreement of repeated ratings: number of pairs, number of equal pairs, and mean distance in categories (None
+    without pairs)."""
 
     pairs: int
     alike: int
@@ -83,8 +85,12 @@ def _units(study, physical):
 
 
 def trust_of(state: LiveSession, block: int, chooser: LiveChooser) -> Trust | None:
-    """`trust` for an optimisation block of a session, with fits for each possible answer to the pending trial, from the
-    chooser's cache; None before the first answer."""
+    """`trust` for an optimisation block of a session; None before the first answer. Posteriors are from the chooser's
+    cache, or fitted.
+
+    `movement` is None unless a trial of this block is pending that is no repetition: the answer to any other does not
+    change the best rendering.
+    """
     answers, trial = Answers.of(state, block), state.pending
     if not answers.categories:
         return None

@@ -47,10 +47,10 @@ def padding(study: Study, capacity: int) -> Float[np.ndarray, "capacity d"]:
 
 
 class Step:
-    """The compiled step of a study and a design.
+    """The compiled step of a study and a design, called with answers.
 
-    Everything but the answers is bound, so that a call costs no look at the study: JAX gets its arrays as one flat
-    tuple, because walking through the records costs more than the fit where caches are cold.
+    Everything but the answers is bound in advance, so that a call does not traverse the study: JAX gets its arrays as
+    one flat tuple, because walking through the records costs more than the fit where caches are cold.
     """
 
     def __init__(self, study: Study, plan: Design) -> None:

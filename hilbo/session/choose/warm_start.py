@@ -1,20 +1,21 @@
 """Warm start of a new participant's session from the population's map; it affects only the choice of renderings.
 
-Somebody new is taken for the population g and a deviation h of their own, f = g + h, whose variance is the share 1 - p
-of the prior's, k. What is known of f at a point before their first answer is then
+A new participant's score is modelled as the population's g and an individual deviation h, f = g + h, where the variance
+of h is the share 1 - p of the prior's, k. The prediction of f at a point before the first answer is then
 
     m0 = mean of the map,    v0 = variance of the map + (1 - p) k,
 
-which takes the prior's place in the committee's rule: with their own posterior m, v under the study's prior k,
+which replaces the prior in the formula of the committee (bcm): with the participant's own posterior m, v under the
+study's prior k,
 
     1 / s = 1 / v0 + (1 / v - 1 / k),    mu = s (m0 / v0 + m / v).
 
-The next rendering has the highest mu + weight · sqrt(s) among fixed feasible points; without answers mu = m0, s = v0,
-and where the map knows nothing the rule is the cold one's but for p. Point by point, as the committee itself is: what
-one answer says of h elsewhere is taken from the study's kernel.
+The next rendering has the highest mu + weight · sqrt(s) among fixed feasible points; without answers mu = m0, s = v0.
+Where the map has no information, this differs from a cold start only by p. Each point is treated by itself, as in the
+committee: what one answer tells about h at other points follows from the study's kernel.
 
-Aggregation, reports and the participant's own optimum are made from their answers under the study's prior alone;
-docs/guides/sessions.md has how many trials this saves (benchmarks/warm_start.py).
+Aggregation, reports and the participant's own optimum are computed from their answers under the study's prior only;
+docs/guides/sessions.md has how many trials a warm start saves (benchmarks/warm_start.py).
 """
 
 import os
@@ -57,7 +58,7 @@ def warm_start(
     """Create a warm start from the map's latent mean and variance, (m,), at candidates `points` (m, d) of the unit
     cube.
 
-    `share`: p of the module; the individual variance (1 - p) k is added. `source`: name of the map.
+    The individual variance (1 - p) k is added to `variance`; `share` is p. `source`: name of the map.
     """
     prior = float(study.gp.kernel.diagonal(points[0]))
     return WarmStart(points, mean, variance + (1.0 - share) * prior, source)
@@ -93,7 +94,8 @@ def warm_point(
 
 def read_warm_start(path: str | os.PathLike, study: Study, seed: int = 0, share: float = SHARE) -> WarmStart:
     """Read a warm start from the map.nc of a results folder: at its points, or interpolated linearly from its grid at
-    points that are seeded by `seed`. Raises InputError for a map of other parameters, or a damaged file."""
+    points that are drawn with `seed`; `share` as in `warm_start`. Raises InputError for a map of other parameters, or a
+    damaged file."""
     from scipy.interpolate import RegularGridInterpolator
 
     from hilbo.study.results.map_netcdf import on_grid, read_map

@@ -235,7 +235,7 @@ def _written(text: Any) -> Any:
     return UNWRITTEN if isinstance(text, str) and runs_in_a_spreadsheet(text) else text
 
 
-def _place(state, trial: Trial):
+def _place(state: LiveSession, trial: Trial) -> dict[str, Any]:
     """Columns that identify a trial: participant, session, phase, material and trial number."""
     data, header = trial.data, state.header
     return {
@@ -247,7 +247,7 @@ def _place(state, trial: Trial):
     }
 
 
-def _times(trial: Trial):
+def _times(trial: Trial) -> dict[str, Any]:
     """Columns `response_time` (s) and `answered_at` (s since the epoch); None where they are not known."""
     answered = trial.answered or {}
     return {
@@ -263,7 +263,7 @@ def _telemetry(trial: Trial) -> dict[str, Any]:
     return {COLUMN: flags, COLUMN_OF_SAMPLES: None if counts is None else counts[SAMPLES]}
 
 
-def _table(rows):
+def _table(rows: list[dict[str, Any]]) -> pd.DataFrame:
     """Data frame of the rows, without optional columns that have no values."""
     table = pd.DataFrame(rows)
     if COLUMN_OF_SAMPLES in table:

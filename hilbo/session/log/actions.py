@@ -83,8 +83,8 @@ def propose(state: LiveSession, chooser: Chooser, at: float) -> Event:
 
 def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event:
     """Event: a rendering is in force. `facts`: what a device reports (CRC, values read back, times), or `values`, those
-    that a stimulus program confirms. Raises RefusedError for a trial that is not pending, and for values beyond the
-    tolerance."""
+    that a stimulus program confirms. Raises RefusedError for a trial that is not pending or lacks the side, and for
+    values beyond the tolerance."""
     pending = _live(state, trial)
     if side not in pending.renderings:
         raise RefusedError("bad-answer", f'trial {trial} has no side "{side}".')
@@ -312,13 +312,13 @@ def device(state: LiveSession, condition: str, at: float, *, trial: int | None =
     return _event(state, "device", at, condition=condition, trial=trial, **facts)
 
 
-def _number(state, phase, material):
+def _number(state: LiveSession, phase: str, material: str | None) -> int:
     """Number (from 1) of the next trial within its phase and material."""
     same = (t for t in state.trials if t.data["phase"] == phase and t.data["material"] == material)
     return 1 + sum(1 for _ in same)
 
 
-def _event(state, kind, at, **data):
+def _event(state: LiveSession, kind: str, at: float, **data: Any) -> Event:
     """Event of this kind with the next sequence number and `data`. Raises RefusedError for a time that is not
     finite."""
     if not math.isfinite(at):
@@ -335,13 +335,13 @@ def _text(text: str) -> str:
     return text
 
 
-def _running(state):
+def _running(state: LiveSession) -> None:
     """Raise RefusedError if the session was aborted."""
     if state.aborted is not None:
         raise RefusedError("over", "the session has ended.")
 
 
-def _live(state, id):
+def _live(state: LiveSession, id: int) -> Trial:
     """Return the trial with this id. Raises RefusedError if it does not exist or is not pending."""
     trial = state.trial(id)
     if trial.status != "pending":
@@ -349,7 +349,7 @@ def _live(state, id):
     return trial
 
 
-def _times(browser):
+def _times(browser: Any) -> dict[str, float]:
     """Copy of the browser's times as floats; {} for None. Raises RefusedError for anything but up to 8 finite numbers
     by name."""
     if browser is None:
@@ -376,7 +376,7 @@ def _counts(telemetry: Mapping[str, int]) -> dict[str, int]:
     return dict(telemetry)
 
 
-def _check_values(state, trial, values):
+def _check_values(state: LiveSession, trial: Trial, values: Any) -> None:
     """Raise RefusedError if `values` are not exactly the answers that the trial's phase asks for, each an allowed
     one."""
     asks = protocol(state.study.session, state.header.blocks[trial.block].phase).asks

@@ -139,7 +139,7 @@ class EventLog:
         check.
 
         Before it is raised, the acknowledged events are copied to a new file next to it; if that fails, each call tries
-        again.
+        again. The file is not compared while part of a failed write cannot be cut off.
         """
         if not self._torn:
             self._fault = self._fault or fault_of(self.path, self._file, self._size)
@@ -169,7 +169,7 @@ class EventLog:
             raise LogError(f"{self.path}: nothing was written, because it could not be read again: {error}") from error
         return line
 
-    def _write(self, line):
+    def _write(self, line: bytes) -> None:
         """Append the bytes `line` to the file and sync it; update the expected size and `sync_s`.
 
         If that fails, the file is cut back to its former size, now or before the next write, and LogError is raised.
@@ -234,7 +234,7 @@ def read_session(
     return _folded(path, study, header, events)
 
 
-def _end(file, path, content, size):
+def _end(file: int, path: str | os.PathLike, content: bytes, size: int) -> None:
     """Make an open log end with its last complete line. `content`: bytes of the file; `size`: bytes of its complete
     lines, with their newlines. Cuts off what follows, or adds the missing newline. Raises InputError if that fails."""
     if size == len(content):
@@ -249,7 +249,7 @@ def _end(file, path, content, size):
         raise InputError(f"{path}: cannot be written ({error.strerror}); free some space and try again.") from error
 
 
-def _check_study(path, study, header):
+def _check_study(path: str | os.PathLike, study: StudyFile, header: Header) -> None:
     """Raise InputError if the header has the hash of another study; `path` is for the message."""
     if header.study != study.hash:
         raise InputError(
@@ -258,7 +258,7 @@ def _check_study(path, study, header):
         )
 
 
-def _folded(path, study, header, events) -> LiveSession:
+def _folded(path: str | os.PathLike, study: StudyFile, header: Header, events: Sequence[Event]) -> LiveSession:
     """Return the state after the events, each of them checked. Raises InputError, with `path`, also for another
     study."""
     _check_study(path, study, header)
@@ -268,14 +268,14 @@ def _folded(path, study, header, events) -> LiveSession:
         raise InputError(f"{path}: {error}") from error
 
 
-def _cut(file, size):
+def _cut(file: int, size: int) -> None:
     """Cut an open file to `size` bytes and sync it; a shorter file stays as it is. Raises OSError."""
     if os.fstat(file).st_size > size:
         os.ftruncate(file, size)
         os.fsync(file)
 
 
-def _content(file) -> bytes:
+def _content(file: int) -> bytes:
     """Read all bytes of an open file, given by its descriptor."""
     os.lseek(file, 0, os.SEEK_SET)
     pieces = []

@@ -126,8 +126,8 @@ class LiveSession:
         return self.header.blocks[block].count + self.extra.get(block, 0)
 
     def stops(self, block: int) -> Counter[Any]:
-        """Number of stops while a rendering was on, by planned trial (index), or in a block that chooses by rendering
-        (items)."""
+        """Number of stops while a rendering was on, and of missed stimuli: by planned trial (index), or in a block that
+        chooses by rendering (items)."""
         voided = ((t, t.voided) for t in self.trials if t.block == block)
         return Counter(stop_key(t, side) for t, why in voided if why is not None for side in why["sides"])
 

@@ -45,8 +45,8 @@ def _sent(state, event):
 
 
 def _stimulus(state, event):
-    """A step of the presentation begins or ends. A rendering counts as presented from the beginning of its step; step 0
-    first resets which sides were presented."""
+    """Record that a step of the presentation begins or ends. A rendering counts as presented from the beginning of its
+    step; step 0 first resets which sides were presented."""
     trial, show = state.trial(event.data["id"]), event.data["show"]
     if not event.data["on"]:
         return state.with_trial(trial.id, on=None)
@@ -120,7 +120,8 @@ def stop_key(trial: Trial, side: str) -> Any:
 
 
 def _made_void(state, trial, by, reason, sides=()):
-    """Set the trial to "void" by "rule" or "experimenter"; a repetition is wanted again unless it was stopped twice.
+    """Set the trial to "void" by "rule" or "experimenter". A repetition is wanted again if the answer that it repeats
+    counts, unless it was stopped twice.
 
     `sides`: those that were on when the device stopped. Stored in `voided` with: `asked_again`, whether a repetition is
     wanted again, and `beside`, the other answers to the same renderings that count now; a later one replaces this

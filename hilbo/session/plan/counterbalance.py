@@ -1,18 +1,18 @@
-"""Orders that balance each other: Williams designs for materials, balanced pairs for comparisons; all from a seed.
+"""Counterbalanced orders: Williams designs for materials, balanced pairs for comparisons; all from a seed.
 
-A *Williams design* of n treatments is a set of orders in which every treatment stands at every position equally often,
-and follows every other equally often: n orders for even n, a Latin square of n and its mirror image, 2n, for odd n
-(E. J. Williams 1949): 6 orders for three materials, 2 for two.
+A *Williams design* of n treatments is a set of orders in which every treatment is at every position equally often, and
+follows every other equally often: n orders for even n, a Latin square of n and its mirror image, 2n, for odd n (E. J.
+Williams 1949): 6 orders for three materials, 2 for two.
 
-`orders` deals them to participants in blocks, each a whole design in a seeded sequence, square by square, treatments
-renamed at random in each block. Over complete blocks positions and ordered neighbours are balanced exactly. Whatever
-the number of participants, each treatment has been at each position the same number of times or once more; of the
-ordered neighbours this holds for even n, for odd n they may differ by two within a block, since half of it cannot
-balance them. Orders: up to three treatments all n! are used equally often, or once more; from four on a block holds a
-few of them, which may come again in the next while others have not been used.
+`orders` assigns them to participants in blocks, each a whole design in a random sequence, square by square, with the
+treatments renamed at random in each block. Over complete blocks positions and ordered neighbours are balanced exactly.
+For any number of participants, the counts of a treatment at the positions differ by at most one; so do those of ordered
+neighbours for even n, while for odd n they may differ by two within a block, since half of it cannot balance them.
+Orders: up to three treatments the counts of all n! orders differ by at most one; from four on a block has only a few of
+them, which may come again in the next block while others have not been used.
 
-All this is of the participants in the plan. Whoever drops out without being replaced leaves their order out, and
-neighbours balance what goes over from one treatment to the next only, not what two before it do.
+All this is of the participants in the plan. The order of a participant who drops out without being replaced is missing,
+and neighbours balance carry-over effects from one treatment to the next only, not to the one after it.
 """
 
 import itertools
@@ -57,12 +57,12 @@ def orders(n: int, participants: int, seed: int) -> Int[np.ndarray, "participant
 
 
 def comparisons(pairs: Sequence[tuple[str, str]], repeats: int, seed: int) -> list[Comparison]:
-    """Random sequence of comparisons: each pair of sets `repeats` times, in rounds of all pairs, the same for the same
+    """Random sequence of comparisons: each pair of sets `repeats` times, in rounds of all pairs; the same for the same
     seed.
 
-    Within each pair, which set is on which side and which is felt first are balanced over every two rounds, and over
-    every four which side is felt first; what fewer rounds leave over is balanced between pairs, and over participants,
-    because the start of each session in this cycle is random. No round begins with the pair that ended the last.
+    Over every two rounds, each set of a pair is once on either side and once felt first; over every four, each side is
+    felt first twice. What fewer rounds leave over is balanced between pairs, and over participants, because each
+    sequence starts at a random place of this cycle. No round begins with the pair that ended the last.
     """
     rng = np.random.default_rng(np.random.SeedSequence([seed, len(pairs), repeats, 2]))
     begin = int(np.random.default_rng(np.random.SeedSequence([seed, len(pairs), repeats, 3])).integers(4))

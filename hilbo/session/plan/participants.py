@@ -104,7 +104,7 @@ def check_consent(people: People, participant: str, protocol_number: str = "") -
     return row
 
 
-def _check(row, place):
+def _check(row: Mapping[str, str], place: str) -> None:
     """Raise InputError for a row with an id that is not pseudonymous, text that a spreadsheet would run as a formula,
     or a consent_time, age or handedness that is not valid. `place` is for messages."""
     check_id(row.get("participant", ""), place)
@@ -124,7 +124,7 @@ def _check(row, place):
         raise InputError(f'{place}: handedness is "{row["handedness"]}"; it must be right, left, both, or empty.')
 
 
-def _check_past(row, place):
+def _check_past(row: Mapping[str, str], place: str) -> None:
     """Raise InputError for a consent_time more than a day in the future: one without a zone may be of another time
     zone."""
     if not row.get("consent_time"):
@@ -134,7 +134,7 @@ def _check_past(row, place):
         raise InputError(f"{place}: consent_time is {row['consent_time']}, which is to come; write when they agreed.")
 
 
-def _write(path, people, delimiter):
+def _write(path: Path, people: People, delimiter: str) -> None:
     """Rewrite the list, with the standard columns first."""
     columns = list(dict.fromkeys((*COLUMNS, *(key for row in people.values() for key in row))))
     rows = [[row.get(column, "") for column in columns] for row in people.values()]

@@ -70,7 +70,7 @@ class Withdrawal(msgspec.Struct):
 
     @property
     def begun(self) -> bool:
-        """Whether this is a plan with any changes, of which some may have been made."""
+        """Whether changes of files are planned here, so that some may have been made if this is a journal."""
         return bool(self.files or self.removed or self.renamed)
 
 
@@ -185,8 +185,10 @@ def _is_shared(path: Path) -> bool:
 
 
 def _planned(root: Path, before: Withdrawal) -> Withdrawal:
-    """Plan all changes, including those of the interrupted withdrawal `before`; changes nothing. Raises InputError if
-    one of the participant's sessions is running."""
+    """Search the folder and plan all changes, including those of the interrupted withdrawal `before`; changes no file.
+
+    Raises InputError if one of the participant's sessions is running.
+    """
     below, person = files_below(root), before.participant
     whose, _ = logs(below.files)
     theirs = [path for path, name in whose.items() if name == person]
