@@ -25,7 +25,11 @@ _FIELDS = {"theta": ("theta",), "variance": ("variance",), "noise": ("noise",), 
 
 
 def coordinates_of(gp: OrdinalGP, learn: Sequence[str]) -> Coordinates:
-    """Coordinates of a model's hyperparameters in `learn`, by name."""
+    """Unconstrained coordinates of those hyperparameters of a model that `learn` names, by coordinate name.
+
+    "thresholds" gives two: `first`, a scalar, and `gaps`, (C - 2,); the others are logarithms of the value's shape.
+    Raises `KeyError` for other names.
+    """
     thresholds = gp.likelihood.thresholds
     every = {
         "theta": jnp.log(gp.kernel.theta),
@@ -38,7 +42,9 @@ def coordinates_of(gp: OrdinalGP, learn: Sequence[str]) -> Coordinates:
 
 
 def model_at(coordinates: Coordinates, gp: OrdinalGP) -> OrdinalGP:
-    """Model with the hyperparameters at these coordinates; the others are as in `gp`."""
+    """Copy of the model `gp` with the hyperparameters at these coordinates; those without a coordinate are as in
+    `gp`.
+    """
     held = {"theta": gp.kernel.theta, "variance": gp.kernel.variance, "noise": gp.likelihood.noise}
     positive = held | {k: jnp.exp(coordinates[k]) for k in held if k in coordinates}
     thresholds = gp.likelihood.thresholds
@@ -50,7 +56,11 @@ def model_at(coordinates: Coordinates, gp: OrdinalGP) -> OrdinalGP:
 
 
 def log_prior(gp: OrdinalGP, centre: OrdinalGP, learn: Sequence[str]) -> Scalar:
-    """Log density of the weak priors at `gp`, up to a constant; `centre` is the model at their centre."""
+    """Log density of the weak priors on the coordinates in `learn`, at the model `gp`, up to a constant: a scalar, in
+    nats.
+
+    `centre`: the model at their centre.
+    """
     coordinates, centres = coordinates_of(gp, learn), coordinates_of(centre, learn)
     scale = dict.fromkeys(coordinates, 1.0) | {"first": jnp.sqrt(centre.kernel.variance)}
     squares = [jnp.sum(((coordinates[k] - centres[k]) / (_PRIOR_SD[k] * scale[k])) ** 2) for k in coordinates]

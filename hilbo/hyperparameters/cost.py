@@ -26,7 +26,9 @@ __all__ = ["Seen", "divisor", "evidence_cost", "person_ep_evidence", "person_evi
 
 
 class Seen(NamedTuple):
-    """Evaluation of the evidence: value, whether it is certified, coordinates, and starts for the next posteriors."""
+    """Evaluation of the evidence: value (summed over participants), whether all posteriors are certified, coordinates
+    (p,), and starts for the next posteriors: `place` and its derivatives by the coordinates, `moved`.
+    """
 
     log_evidence: Scalar
     certified: Bool[Array, ""]
@@ -38,10 +40,11 @@ class Seen(NamedTuple):
 def evidence_cost(
     gp: OrdinalGP, trials: Trials, learn: tuple[str, ...], weak_priors: bool, inference: str
 ) -> tuple[Callable[[Coordinates, Seen], Expansion], Seen]:
-    """Build the objective of stacked `trials`, and an empty evaluation.
+    """Build the objective to be minimised for stacked `trials`, and an empty evaluation to begin with.
 
-    The objective maps coordinates and the last evaluation to an expansion, which carries the new evaluation; the
-    posteriors are started from the last one.
+    The objective maps coordinates and the last evaluation to the expansion (value, gradient, Hessian) of minus the log
+    evidence over `divisor`, with the weak priors if wanted; its `aux` is the new evaluation. The posteriors are started
+    from the last one. `learn`: names of hyperparameters; `inference`: "laplace", "ep" or "ep_corrected".
     """
     initial = ravel_pytree(coordinates_of(gp, learn))[0]
     zero = jnp.zeros((), initial.dtype)
@@ -61,21 +64,25 @@ def evidence_cost(
 
 
 def divisor(trials: Trials) -> Scalar:
-    """Divisor of the evidence: number of responses + 1, which scales curvatures to about 1; never 0."""
+    """Divisor of the evidence, a scalar: number of responses + 1, which scales curvatures to about 1; never 0."""
     return jnp.sum(trials.mask, dtype=trials.x.dtype) + 1.0
 
 
 def _no_starts(
     trials: Trials, initial: Float[Array, " p"], inference: str
 ) -> tuple[PyTree[Float[Array, "M n"]], PyTree[Float[Array, "M n p"]]]:
-    """Empty starting values of the posteriors and their derivatives."""
+    """Starting values of the posteriors that stand for no start, and their derivatives, which are 0; `initial` (p,):
+    coordinates. Empty tuples for an inference without starts.
+    """
     none = jnp.zeros(trials.q.shape, initial.dtype)
     place = {"laplace": none, "ep": (none, none - jnp.inf)}.get(inference, ())
     return place, jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, initial.size), leaf.dtype), place)
 
 
 def _differentiated(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordinates, last: Seen) -> Expansion:
-    """Expansion of the summed evidence by automatic differentiation."""
+    """Value, gradient and Hessian of the log evidence summed over participants, by automatic differentiation; `aux` is
+    the evaluation. `last` is ignored.
+    """
     del last
     flat, restore = ravel_pytree(coordinates)
 
@@ -92,9 +99,10 @@ def _differentiated(gp: OrdinalGP, trials: Trials, inference: str, coordinates: 
 
 
 def _closed(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordinates, last: Seen) -> Expansion:
-    """Expansion of the summed evidence in closed form.
+    """Value, gradient and Hessian of the log evidence summed over participants, in closed form; `aux` is the
+    evaluation.
 
-    The posteriors are started from extrapolations of the last ones.
+    The posteriors are started from extrapolations of those of the evaluation `last`.
     """
     expansion = {"laplace": person_evidence, "ep": person_ep_evidence}[inference]
     flat, _ = ravel_pytree(coordinates)
@@ -112,9 +120,9 @@ def _closed(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordina
 
 @one_at_a_time
 def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: Vector) -> Evidence:
-    """Laplace's log evidence of one participant, expanded in the coordinates (in alphabetical order).
+    """Laplace's log evidence of one participant, with gradient and Hessian in the coordinates (in alphabetical order).
 
-    `start`: weights from which the mode is searched.
+    `start` (n,): weights from which the mode is searched.
     """
     return laplace_evidence(*_parts(gp, coordinates, trials, start.dtype, OrdinalTerms), start)
 
@@ -123,7 +131,10 @@ def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, sta
 def person_ep_evidence(
     gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: tuple[Vector, Vector]
 ) -> Evidence:
-    """EP's log evidence of one participant, expanded in the coordinates; `start` as for [`ep_evidence`][]."""
+    """EP's log evidence of one participant, with gradient and Hessian in the coordinates (in alphabetical order).
+
+    `start`: means and log variances (n,) of the cavities, as for [`ep_evidence`][].
+    """
     return ep_evidence(*_parts(gp, coordinates, trials, start[0].dtype, TiltedTerms), start)
 
 
@@ -138,7 +149,10 @@ def _parts(
     Float[Array, " l"],
     Float[Array, " k"],
 ]:
-    """K as a function of the kernel's coordinates, terms as one of the likelihood's, and both coordinate vectors."""
+    """Arguments of the evidence functions for one participant: K as a function of the kernel's coordinates (k,), terms
+    of the class `terms` as a function of the likelihood's coordinates (l,), and both vectors, the likelihood's first,
+    in `dtype`.
+    """
     of_likelihood = {name: value for name, value in coordinates.items() if name in OF_THE_LIKELIHOOD}
     of_kernel = {name: value for name, value in coordinates.items() if name not in OF_THE_LIKELIHOOD}
     flat_likelihood, restore_likelihood = ravel_pytree(of_likelihood)

@@ -44,11 +44,12 @@ def ep_evidence(
     shape: Float[Array, " k"],
     start: tuple[Vector, Vector],
 ) -> Evidence:
-    """Expansion of EP's log evidence in x = (of_terms, shape): terms depend on `of_terms`, the covariance on `shape`.
+    """Value, gradient and Hessian of EP's log evidence in x = (of_terms, shape).
 
-    `start`: means and log variances of cavities from which the fixed point is searched, as in the result's `place`;
-    variances that are not positive mark no start. Extrapolating logarithms saves a quarter of the steps that variances
-    would take.
+    `terms` is a function of the coordinates `of_terms` (l,), the `covariance` K (n, n) one of `shape` (k,). `start`:
+    means and log variances (n,) of cavities from which the fixed point is searched, as in the result's `place`;
+    variances that are not positive or not finite mark no start. Extrapolating logarithms saves a quarter of the steps
+    that variances would take. Never raises: read `certified`.
     """
     matrix, slopes = covariance(shape), jax.jacfwd(covariance)(shape)
     tilted = terms(of_terms)
@@ -83,7 +84,7 @@ def ep_evidence(
 
 
 class _Attempt(NamedTuple):
-    """Result of an attempt: fixed point, its posterior, whether the residual was met, and attempts left."""
+    """Result of an attempt: cavities, their posterior, whether the residual was met, and number of attempts left."""
 
     cavities: Cavities
     post: Conditioned
@@ -92,7 +93,10 @@ class _Attempt(NamedTuple):
 
 
 def _found_fixed_point(terms: Tilted, matrix: Matrix, start: Cavities) -> _Attempt:
-    """Find the fixed point in a `hasty` search, with a second, full search if its residual is not met."""
+    """Search for the fixed point: first a `hasty` search; if its residual, computed afterwards, is not met, a full one.
+
+    Returns the last attempt, which may not have met its residual (`met`).
+    """
 
     def attempt(last: _Attempt) -> _Attempt:
         mean, variance, search = find(terms, matrix, last.cavities, _STEPS, last.left == 2)
@@ -134,9 +138,9 @@ def _moves(
     post: Conditioned,
     slopes: Float[Array, "n n k"],
 ) -> _Moves:
-    """Derivatives of the fixed point by the hyperparameters.
+    """Derivatives of the fixed point by the p = l + k hyperparameters, (n, p) each.
 
-    `slopes`: dK/dx of the covariance's hyperparameters, which come after the terms' `of_terms`.
+    `slopes` (n, n, k): dK/dx of the covariance's hyperparameters, which come after the terms' `of_terms` (l,).
     """
     mean, variance = cavities
     sites = sites_of(terms(of_terms), mean, variance)
@@ -164,7 +168,7 @@ def _moves(
 
 
 def _bilinear(weights: Vector, precision: Vector, variance: Vector, moves: _Moves) -> Float[Array, "p p"]:
-    """Part of the Hessian made of products of two first derivatives, symmetrised."""
+    """Part (p, p) of the Hessian made of products of two first derivatives of `moves`, symmetrised."""
     stretch = (1.0 + variance * precision)[:, None]
     by_variance = weights[:, None] * moves.slope_x - 0.5 * moves.precision_x / stretch**2
     by_terms = moves.slope_x.T @ moves.mean + by_variance.T @ moves.variance
@@ -173,6 +177,6 @@ def _bilinear(weights: Vector, precision: Vector, variance: Vector, moves: _Move
 
 
 def _twice(post: Conditioned, slopes: Float[Array, "n n k"]) -> Float[Array, "k k"]:
-    """tr(C K_k C K_j) / 2."""
+    """Matrix (k, k) of tr(C K_k C K_j) / 2, a part of the Hessian; `slopes` (n, n, k): the K_k."""
     through = jnp.einsum("ij,jlk->kil", post.inverse, slopes)
     return 0.5 * jnp.einsum("kil,jli->kj", through, through)

@@ -26,7 +26,11 @@ TRUSTED = 0.05
 
 
 class Judged(eqx.Module):
-    """Learnt hyperparameters and the error of Laplace's evidence; leading axes as of `MaximumEvidence`."""
+    """Learnt hyperparameters and the error of Laplace's evidence; leading axes as of `MaximumEvidence`.
+
+    `error`: Laplace's minus EP's evidence, nats per response; `again`: whether the hyperparameters were learnt again by
+    expectation propagation.
+    """
 
     maximum: MaximumEvidence
     error: Float[Array, "*M"]
@@ -44,10 +48,12 @@ def maximise_judged(
     weak_priors: bool = True,
     inference: str = "laplace",
 ) -> Judged:
-    """Learn hyperparameters of stacked trials (M, n) by maximum evidence, and check those by Laplace's method.
+    """Learn hyperparameters of stacked trials (M, n) by maximum evidence; where Laplace's evidence is off by more than
+    `TRUSTED`, or not finite, learn them again by expectation propagation.
 
-    `shared`: the same for all participants, else individual ones; `inference`: method of the evidence. Not under `jit`:
-    what is learnt again depends on values.
+    `learn`: names of hyperparameters; `shared`: the same for all participants, else individual ones; `inference`:
+    method of the evidence; with another than "laplace" nothing is checked, and the error is 0. Not under `jit`: what is
+    learnt again depends on values. Raises `InputError` as `maximise_evidence`.
     """
     settings = (tuple(learn), shared, weak_priors)
     maximum = _learnt(gp, trials, *settings, inference)
@@ -62,7 +68,9 @@ def maximise_judged(
 
 
 def judged_sentences(judged: Judged) -> list[str]:
-    """Messages about hyperparameters for which Laplace's evidence was inaccurate; empty if there are none."""
+    """A list with one sentence if hyperparameters were learnt again because Laplace's evidence was inaccurate; else an
+    empty list.
+    """
     again, error = np.atleast_1d(np.asarray(judged.again)), np.atleast_1d(np.asarray(judged.error))
     if not again.any():
         return []
@@ -74,7 +82,7 @@ def judged_sentences(judged: Judged) -> list[str]:
 
 
 def _like(flags: Bool[Array, "*M"], leaf: Array) -> Bool[Array, "..."]:
-    """Flags reshaped to broadcast against `leaf`."""
+    """Flags with axes of length 1 appended, so that they broadcast against `leaf`."""
     return flags.reshape(*flags.shape, *(1,) * (leaf.ndim - flags.ndim))
 
 
@@ -82,7 +90,9 @@ def _like(flags: Bool[Array, "*M"], leaf: Array) -> Bool[Array, "..."]:
 def _learnt(
     gp: OrdinalGP, trials: Trials, learn: tuple[str, ...], shared: bool, weak_priors: bool, inference: str
 ) -> MaximumEvidence:
-    """Maximum-evidence hyperparameters, shared or one participant after the other."""
+    """Maximum-evidence hyperparameters of stacked trials: one set if `shared`, else one for each participant,
+    stacked.
+    """
     if shared:
         return maximise_shared_evidence(gp, trials, learn, weak_priors=weak_priors, inference=inference)
     return jax.lax.map(lambda t: maximise_evidence(gp, t, learn, weak_priors=weak_priors, inference=inference), trials)
@@ -90,7 +100,10 @@ def _learnt(
 
 @program
 def _error(maximum: MaximumEvidence, trials: Trials, shared: bool) -> Float[Array, "*M"]:
-    """Laplace's minus EP's log evidence per response: of all participants together if `shared`, else of each."""
+    """Laplace's minus EP's log evidence, nats per response, at the learnt hyperparameters.
+
+    A scalar over all participants if `shared`, else (M,), 0 for a participant without responses.
+    """
 
     def by_ep(gp, trials):
         return fit(gp, trials, inference="ep", throw=False).log_evidence

@@ -40,7 +40,11 @@ _STEPS = 200
 
 
 class Evidence(NamedTuple):
-    """Log evidence in p hyperparameters x, its derivatives, and the posterior at which it was computed."""
+    """Log evidence in p hyperparameters x, its derivatives, and the posterior at which it was computed.
+
+    `place`: start for the next hyperparameters, Laplace's weights or means and log variances of EP's cavities, (n,);
+    `moved`: its derivatives (n, p); `certified`: whether the search converged and the evidence is accurate.
+    """
 
     value: Scalar
     gradient: Float[Array, " p"]
@@ -63,7 +67,10 @@ class Conditioned(NamedTuple):
 
 
 def conditioned(matrix: Matrix, curvature: Vector) -> Conditioned:
-    """Compute C = (K + 1/W)^-1, T = I - C K, S = (K^-1 + W)^-1 with its diagonal, and log|I + KW|."""
+    """C = (K + 1/W)^-1, T = I - C K, S = (K^-1 + W)^-1 with its diagonal, and log|I + KW|.
+
+    `matrix` K (n, n), `curvature` W >= 0 (n,).
+    """
     root, _, lower = factorise(matrix, curvature)
     factor = solve_lower(lower, jnp.diag(root))
     through = factor @ matrix
@@ -80,9 +87,9 @@ def certified(
     post: Conditioned,
     curvature_at: Callable[[Vector], Vector],
 ) -> Bool[Array, ""]:
-    """Whether the evidence is accurate and no variance is below its rounding error.
+    """Whether the evidence `value` is finite and accurate, and no posterior variance is below its rounding error.
 
-    `at_mode`: mode, weights, curvatures.
+    `matrix` K (n, n); `at_mode`: mode, weights, curvatures, (n,) each; `curvature_at`: eta (n,) -> curvatures (n,).
     """
     eta, weights, curvature = at_mode
     largest = jnp.max(jnp.diagonal(matrix))
@@ -100,9 +107,10 @@ def laplace_evidence(
     shape: Float[Array, " k"],
     start: Vector,
 ) -> Evidence:
-    """Expansion of Laplace's log evidence in x = (of_terms, shape): terms depend on `of_terms`, covariance on `shape`.
+    """Value, gradient and Hessian of Laplace's log evidence in x = (of_terms, shape).
 
-    `start`: weights from which the mode is searched; if that fails it is searched from 0.
+    `terms` is a function of the coordinates `of_terms` (l,), the `covariance` K (n, n) one of `shape` (k,). `start`
+    (n,): weights from which the mode is searched; if that fails it is searched from 0. Never raises: read `certified`.
     """
     matrix, slopes = covariance(shape), jax.jacfwd(covariance)(shape)
     pointwise = terms(of_terms)
@@ -150,9 +158,10 @@ def _paths(
     slopes: Float[Array, "n n k"],
     posterior: tuple[Matrix, Vector, Vector],
 ) -> _Paths:
-    """Derivatives of mode, weights and curvatures by the hyperparameters, and the adjoint.
+    """Derivatives of mode, weights and curvatures by the p = l + k hyperparameters, (n, p) each, and the adjoint (n,).
 
-    `slopes`: dK/dx of the covariance's hyperparameters; `posterior`: K, weights and curvatures at the mode.
+    `slopes` (n, n, k): dK/dx of the covariance's hyperparameters, which come after the terms' `of_terms` (l,);
+    `posterior`: K, weights and curvatures at the mode.
     """
     matrix, weights, curvature = posterior
 
@@ -175,7 +184,9 @@ def _paths(
 
 
 def _bilinear(matrix: Matrix, post: Conditioned, slopes: Float[Array, "n n k"], paths: _Paths) -> Float[Array, "p p"]:
-    """Part of the Hessian made of products of two first derivatives."""
+    """Part (p, p) of the Hessian made of products of two first derivatives; `matrix` K (n, n), `slopes` (n, n, k):
+    dK/dx.
+    """
     terms_count, count = paths.mean.shape[1] - slopes.shape[2], slopes.shape[2]
     through = [post.inverse @ slopes[:, :, k] for k in range(count)]
     narrowed = [jnp.sum(post.transfer * (slopes[:, :, k] @ post.transfer), axis=0) for k in range(count)]

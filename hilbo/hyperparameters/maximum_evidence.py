@@ -49,7 +49,12 @@ _FLAT = (
 
 
 class MaximumEvidence(eqx.Module):
-    """Model with learnt hyperparameters, and the outcome of the search; leading axes for several participants."""
+    """Model with learnt hyperparameters, and the outcome of the search; leading axes for several participants.
+
+    `log_evidence` is without the weak priors; `converged`: the gradient vanished, and the fits at the end are
+    certified; `runaway`: a hyperparameter changed by more than a factor 1000 or is undetermined, so that the evidence
+    has no maximum in reach.
+    """
 
     gp: OrdinalGP
     log_evidence: Float[Array, "*M"]
@@ -90,10 +95,11 @@ def maximise_evidence(
     - `learn`: which of "theta", "variance", "noise", "thresholds". A `theta` of shape (d,) is learnt per dimension.
     - `weak_priors`: add the log prior above.
     - `inference`: method of the evidence, "laplace", "ep" or "ep_corrected"; "exact" has no derivatives.
-    - `starts`: number of searches, from the model's values with theta and noise scaled by powers of 2; the best one
-      wins.
+    - `starts`: number of searches, from the model's values with theta and noise scaled by powers of 4 and 1/2; the best
+      one wins.
 
-    Raises `InputError` for unknown names in `learn`, and for an inference without derivatives.
+    Raises `InputError` for unknown or no names in `learn`, for variance, noise and thresholds together, and for an
+    inference without derivatives. A search that fails does not raise: read `converged` and `runaway`.
     """
     options = _Options(_checked(learn, inference), weak_priors, starts, inference)
     return _maximise(gp, jax.tree.map(lambda leaf: leaf[None], trials), options)
@@ -125,15 +131,17 @@ class _Options(NamedTuple):
 
 
 def _maximise(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence:
-    """Check the options, then search.
-
-    Participant by participant on a CPU, each search stopping when it has converged.
+    """`_search`, in a form for `vmap`: participant by participant on a CPU, each search stopping when it has
+    converged.
     """
     return one_at_a_time(lambda gp, trials: _search(gp, trials, options))(gp, trials)
 
 
 def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence:
-    """Search from several starts and return the best result; `trials` are stacked."""
+    """Search from several starts and return the best result, converged or not; `trials` (M, n) are stacked.
+
+    One set of hyperparameters for all of them. The options are not checked.
+    """
     expand, nothing = evidence_cost(gp, trials, options.learn, options.weak_priors, options.inference)
 
     def cost(coordinates, _):
@@ -188,7 +196,7 @@ class _End(NamedTuple):
 
 
 def _best(ends: _End, starts: int) -> _End:
-    """Best of the stacked ends.
+    """Best of the stacked ends: the one with the smallest `value`.
 
     In a tie the search from the model itself wins, as without responses or certified ends.
     """
@@ -198,12 +206,17 @@ def _best(ends: _End, starts: int) -> _End:
 
 
 def _flat(end: Expansion, trials: Trials) -> Bool[Array, ""]:
-    """Whether some hyperparameter is undetermined: the smallest curvature of the log evidence is below `_FLAT`."""
+    """Whether some hyperparameter is undetermined: the smallest curvature of the objective, times `divisor`, is below
+    `_FLAT`.
+    """
     return eigh(end.hessian)[0][0] * divisor(trials) < _FLAT
 
 
 def _checked(learn: Sequence[str], inference: str) -> tuple[str, ...]:
-    """Return `learn` as a tuple. Raises `InputError` for unknown names and for a scale that is not determined."""
+    """Return `learn` as a tuple.
+
+    Raises `InputError` for unknown or no names, for variance, noise and thresholds together, and for exact inference.
+    """
     learn = tuple(learn)
     unknown = [name for name in learn if name not in get_args(Learnable)]
     if unknown or not learn:
@@ -222,12 +235,14 @@ def _checked(learn: Sequence[str], inference: str) -> tuple[str, ...]:
 
 
 def _row_of_model(starts: int) -> int:
-    """Index of the starting point that is the model itself."""
+    """Index of the starting point that is the model itself, the middle one."""
     return (starts - 1) // 2
 
 
 def _spread(initial: Coordinates, starts: int) -> Coordinates:
-    """Starting points: theta times rising powers of 4, noise times powers of 1/2, the model itself in the middle."""
+    """Starting points, stacked along a first axis: theta times rising powers of 4, noise times rising powers of 1/2,
+    the model itself in the middle; other coordinates unchanged.
+    """
     power = (jnp.arange(starts) - _row_of_model(starts)).astype(initial[next(iter(initial))].dtype)
     step = {"theta": 1.4, "noise": -0.7}  # 4 and 1/2, as logarithms
     return {
@@ -247,14 +262,19 @@ def optimum_sensitivity(
     walls: Polytope | None = None,
     held: Bool[Array, " d"] | None = None,
 ) -> Coordinates:
-    """Derivative of an optimum x (unit cube) by each learnt hyperparameter: a record of arrays (d, ...).
+    """Derivative of an optimum x (unit cube) by each learnt hyperparameter: a record of arrays (d, ...) by coordinate.
 
     At a maximum the gradient along free directions is 0, so that by the implicit function theorem dw = -H^-1
     d(gradient) there; directions across an active wall stay fixed. Positive hyperparameters are on a log scale.
 
-    **Arguments:** `height` of the map at box coordinates, given what `refit` makes of a model; its maximum `w`; the
-    model; and `from_box`, to the unit cube. `walls`: constraints of the maximum in addition to the cube's; `held`:
-    coordinates with discrete steps, which a small change does not move.
+    **Arguments:**
+
+    - `height`: of the map at box coordinates (d,), given the result of `refit`; `w` (d,): box coordinates of its
+      maximum.
+    - `refit`: model -> data of the map, for `height`; `gp`: the model at which to differentiate.
+    - `from_box`: box coordinates (d,) -> point of the unit cube (d,).
+    - `walls`: constraints of the maximum in addition to the cube's.
+    - `held`: coordinates with discrete steps, which a small change does not move; has an effect only with `walls`.
     """
     coordinates = coordinates_of(gp, learn)
     # Forward over forward: forward over reverse drops custom derivative rules inside a scan (docs/design.md).
@@ -274,7 +294,9 @@ def optimum_sensitivity(
 def _free_directions(
     w: Float[Array, " d"], walls: Polytope | None, held: Bool[Array, " d"] | None
 ) -> Float[Array, "d d"]:
-    """Projection onto the directions in which a maximum may move: those along its active walls."""
+    """Projection (d, d) onto the directions in which a maximum at `w` (d,) may move: those along its active walls, and
+    not those of `held` coordinates. Without `walls`, `held` is ignored.
+    """
     inside = (w > _AT_A_WALL) & (w < 1.0 - _AT_A_WALL)
     if walls is None:
         return jnp.diag(inside.astype(w.dtype))

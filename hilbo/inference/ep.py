@@ -1,10 +1,10 @@
 """Expectation propagation for latent values with a Gaussian prior and a product of pointwise likelihood terms.
 
 Model: eta ~ N(0, K), p(data | eta) = prod_i p_i(eta_i), each log-concave. The posterior is approximated by a Gaussian
-that has the mean and the variance of every *tilted* distribution p_i(eta_i) N(eta_i; m_i, v_i), where the cavity
-N(m_i, v_i) is what all the other answers say of eta_i. All that is asked of a term is
-L_i(m, v) = log of the integral of p_i(eta) N(eta; m, v), its slope a_i = dL_i/dm, and the precision t_i >= 0 of the
-Gaussian site that stands for it. With these the fixed point reads
+that has the mean and the variance of every *tilted* distribution p_i(eta_i) N(eta_i; m_i, v_i), where the cavity N(m_i,
+v_i) is the approximate distribution of eta_i given all other responses. A term has to provide L_i(m, v) = log of the
+integral of p_i(eta) N(eta; m, v), its slope a_i = dL_i/dm, and the precision t_i >= 0 of the Gaussian site that stands
+for it. With these the fixed point reads
 
     m + v a = K a  (the means agree),      v_i = s_i / (1 - t_i s_i),  s = diag (K^-1 + T)^-1  (the variances agree),
 
@@ -15,14 +15,14 @@ curvatures, and `predict`, the committee machine and the acquisition work on it 
 
 Rasmussen & Williams' (3.65) without its differences of large terms, and without 1/t, so that t = 0 is no special case.
 
-* Coordinates as in `laplace`: eta = R w, R the eigenvector root of K, and only I + R'TR >= 1 is factorised. K may be
-  singular (the same stimulus asked twice); nothing is added to it.
-* The search begins at Laplace's mode, which is near, or at `start`, and with S = K - K C K, which needs no root. Where
-  it does not end below the tolerance it begins anew with R and from the prior; where S lost digits it goes on with R.
-* For given v the means are the maximum of a concave function, so that only v is in need of a careful search. Far from
-  the fixed point damped parallel updates, near it Newton's steps in (m, v), the mean eliminated: n unknowns. A Newton
-  step that does not halve the mismatch sends the search back to updates, which are damped more the longer they take.
-* Derivatives by the implicit function theorem with the matrix of the Newton steps. The evidence is stationary in the
+- Coordinates as in `laplace`: eta = R w, R the eigenvector root of K, and only I + R'TR >= 1 is factorised. K may be
+  singular (repeated stimuli); nothing is added to it.
+- The search begins at Laplace's mode, which is near, or at `start`, and with S = K - K C K, which needs no root. Where
+  it does not end below the tolerance it restarts with R and from the prior; where S lost digits it continues with R.
+- For given v the means are the maximum of a concave function, so that only v needs a careful search. Far from the fixed
+  point damped parallel updates, near it Newton's steps in (m, v), the mean eliminated: n unknowns. A Newton step that
+  does not halve the mismatch returns the search to updates, which are damped more the longer they take.
+- Derivatives by the implicit function theorem with the matrix of the Newton steps. The evidence is stationary in the
   sites, so that its gradient, a'dK a / 2 - tr(C dK) / 2 + sum_i dL_i, needs none of them.
 
 References: Minka (2001), UAI; Rasmussen & Williams (2006), section 3.6; Seeger (2005), "Expectation propagation for
@@ -60,7 +60,8 @@ def ep(covariance: Matrix, terms: Tilted, *, start: Vector | None = None, max_st
     - `covariance`: K, (n, n), symmetric, positive semi-definite. Terms that always return 0 (padding) change nothing.
     - `terms`: cavity means and variances (n,) -> L, slopes and precisions, (n,) each; a pytree (e.g. an `eqx.Module`)
       if it holds arrays that are traced.
-    - `start`: `weights` of an earlier, similar fit (also Laplace's); changes the number of steps, not the result.
+    - `start`: `weights` (n,) of an earlier, similar fit (also Laplace's); changes the number of steps, not the result.
+    - `max_steps`: largest number of steps of each search.
 
     **Returns:** the posterior in the record of [`laplace`][hilbo.laplace.laplace]: `mode` is its mean, `weights` are
     the slopes a. Differentiable in `covariance` and in the arrays of `terms`. Never raises: check
@@ -71,7 +72,10 @@ def ep(covariance: Matrix, terms: Tilted, *, start: Vector | None = None, max_st
 
 
 def gaussian(terms: Tilted, covariance: Matrix, mean: Vector, variance: Vector, cavities: Found) -> GaussianPosterior:
-    """Posterior and certificate for the cavities at which `fixed_point` ended."""
+    """Posterior and certificate for given cavities, such as those at which `fixed_point` ended.
+
+    `mean`, `variance` (n,): of the cavities; `cavities`: record of their search, for the certificate.
+    """
     _, slope, precision = terms(mean, variance)
     inverse, _ = inverse_and_log_determinant(covariance, precision)
     log_evidence = _log_evidence(terms, covariance, mean, variance)
@@ -102,26 +106,36 @@ def gaussian(terms: Tilted, covariance: Matrix, mean: Vector, variance: Vector, 
 def fixed_point(
     terms: Tilted, covariance: Matrix, start: Vector | None, max_steps: int
 ) -> tuple[Vector, Vector, Found]:
-    """Cavity means and variances at the fixed point, and the record of the search."""
+    """Cavity means and variances (n,) at the fixed point, and the record of the search, which may not have converged.
+
+    Arguments as for `find`. Means and variances are differentiable in the arrays of `terms` and in `covariance`.
+    """
     return find(terms, covariance, start, max_steps)
 
 
 @jax.custom_jvp
 def _joint(covariance: Matrix, precision: Vector, root: Matrix) -> Matrix:
-    """S from the root R of K, without the cancellation in K - K C K; its derivative rule does not need that of R."""
+    """S = (K^-1 + T)^-1, (n, n), from a root R of K, without the cancellation in K - K C K.
+
+    `precision` (n,): T. Differentiable in `covariance` and `precision`; the root must be that of `covariance` and needs
+    no derivative.
+    """
     return joint_of(covariance, root, precision).covariance
 
 
 @_joint.defjvp
 def _joint_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Matrix, Matrix]:
-    """dS = (I - S T) dK (I - S T)' - S dT S."""
+    """Result of `_joint` and its tangent dS = (I - S T) dK (I - S T)' - S dT S."""
     joint = _joint(*primals)
     transfer = jnp.eye(joint.shape[0], dtype=joint.dtype) - joint * primals[1][None, :]
     return joint, transfer @ tangents[0] @ transfer.T - (joint * tangents[1][None, :]) @ joint
 
 
 def joint_at(covariance: Matrix, sites: Sites, variance: Vector) -> tuple[Joint, Matrix]:
-    """Joint posterior S at the fixed point in differentiable form, and the transfer matrix I - S T."""
+    """Joint posterior at the fixed point, and the transfer matrix I - S T, (n, n), both in differentiable form.
+
+    `variance` (n,): of the cavities.
+    """
     root, _ = square_root(jax.lax.stop_gradient(covariance))
     joint = _joint(covariance, sites.precision, root)
     transfer = jnp.eye(variance.shape[0], dtype=variance.dtype) - joint * sites.precision[None, :]
@@ -131,20 +145,20 @@ def joint_at(covariance: Matrix, sites: Sites, variance: Vector) -> tuple[Joint,
 @jax.custom_jvp
 @one_at_a_time
 def inverse_of(matrix: Matrix) -> Matrix:
-    """Matrix inverse with an explicit derivative rule."""
+    """Inverse of a matrix (n, n), with an explicit derivative rule. A singular one gives inf or NaN."""
     return jnp.linalg.inv(matrix)
 
 
 @inverse_of.defjvp
 def _inverse_of_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Matrix, Matrix]:
-    """Derivative of the inverse: -A⁻¹ dA A⁻¹."""
+    """Result of `inverse_of` and its tangent -A⁻¹ dA A⁻¹."""
     inverse = inverse_of(*primals)
     return inverse, -inverse @ tangents[0] @ inverse
 
 
 @fixed_point.def_jvp
 def _fixed_point_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-    """Derivative of the fixed point by the implicit function theorem.
+    """Result of `fixed_point` and its tangents, by the implicit function theorem; the record of the search has none.
 
     With P = I - K C = I - S T both matching conditions give
 
@@ -179,7 +193,7 @@ def _fixed_point_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) 
 
 @eqx.filter_custom_jvp
 def _log_evidence(terms: Tilted, covariance: Matrix, mean: Vector, variance: Vector) -> Scalar:
-    """Log evidence of EP at the given cavities."""
+    """Log evidence of EP at the given cavities, whose means and variances are (n,): a scalar, in nats."""
     values, slope, precision = terms(mean, variance)
     _, log_determinant = inverse_and_log_determinant(covariance, precision)
     joined = jnp.sum(values + 0.5 * jnp.log1p(variance * precision))
@@ -188,9 +202,9 @@ def _log_evidence(terms: Tilted, covariance: Matrix, mean: Vector, variance: Vec
 
 @_log_evidence.def_jvp
 def _log_evidence_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Scalar, Scalar | None]:
-    """Derivative of the log evidence.
+    """Result of `_log_evidence` and its tangent, by the arrays of the terms and the covariance.
 
-    It is stationary in the cavities at the fixed point, so their tangents drop out.
+    Valid at the fixed point, where the evidence is stationary in the cavities, so that their tangents drop out.
     """
     terms, covariance, mean, variance = primals
     _, slope, precision = terms(mean, variance)

@@ -65,7 +65,9 @@ def ep_corrected(
 
 
 class _Cumulants(eqx.Module):
-    """Inputs of the correction: e and its slopes (in mean and variance), S, and the slopes of t."""
+    """Inputs of the correction: e and its slopes (in mean and variance), S, and the slopes of t by mean and
+    variance.
+    """
 
     skew: Vector
     skew_slopes: tuple[Vector, Vector]
@@ -75,7 +77,7 @@ class _Cumulants(eqx.Module):
 
 
 def _skewness(terms: Tilted, mean: Vector, variance: Vector) -> tuple[Vector, tuple[Vector, Vector]]:
-    """e, and its slopes in cavity mean and variance."""
+    """e (n,), and its slopes (n,) in cavity mean and variance; `mean`, `variance` (n,): of the cavities."""
 
     def skew(mean: Vector, variance: Vector) -> Vector:
         (_, _, precision), (_, _, slope) = jax.jvp(lambda m: terms(m, variance), (mean,), (jnp.ones_like(mean),))
@@ -92,12 +94,12 @@ def _off_diagonal(covariance: Matrix) -> Matrix:
 
 
 def _correction(cumulants: _Cumulants) -> Scalar:
-    """R, the correction of the log evidence."""
+    """R, the correction of the log evidence: a scalar, in nats."""
     return cumulants.skew @ (_off_diagonal(cumulants.covariance) ** 3 @ cumulants.skew) / 12.0
 
 
 def _correction_slopes(cumulants: _Cumulants) -> tuple[Vector, Vector]:
-    """dR/dm and dR/dv, including the part through S: dS = -S dT S."""
+    """dR/dm and dR/dv, (n,) each, including the part through S: dS = -S dT S."""
     covariance = _off_diagonal(cumulants.covariance)
     by_skew = covariance**3 @ cumulants.skew / 6.0
     pairs = cumulants.skew[:, None] * covariance**2 * cumulants.skew[None, :]
@@ -107,7 +109,11 @@ def _correction_slopes(cumulants: _Cumulants) -> tuple[Vector, Vector]:
 
 
 def _corrected_factor(factor: Matrix, precision: Vector, skew: Vector, widened: Matrix) -> Matrix:
-    """V with V'V = the corrected C: a factor of I + A X A' (near I) times EP's own, to avoid cancellation."""
+    """V (n, n) with V'V = the corrected C: a factor of I + A X A' (near I) times EP's own `factor`, to avoid
+    cancellation.
+
+    `precision` t and `skew` e (n,); `widened` X (n, n). NaN if the corrected C is not positive definite.
+    """
     informed = precision > 0
     ratio = jnp.where(informed, skew / jnp.where(informed, precision, 1.0), 0.0)
     around = factor * ratio[None, :]

@@ -23,19 +23,21 @@ _BASIN = 3.0  # mismatch, in posterior sds, below which Newton's step is tried
 
 
 class Cavities(NamedTuple):
-    """Cavity means and variances; variances that are not positive mark the absence of a start."""
+    """Cavity means and variances, (n,) each; variances that are not positive mark the absence of a start."""
 
     mean: Vector
     variance: Vector
 
     @property
     def known(self) -> Bool[Array, ""]:
-        """Whether it is a start."""
+        """Whether these are a start: all variances are positive, and all numbers finite. A scalar."""
         return jnp.all((self.variance > 0) & jnp.isfinite(self.variance) & jnp.isfinite(self.mean))
 
 
 class Found(NamedTuple):
-    """Record of the search; `changed` is the change of K by its square root, 0 where none was needed."""
+    """Record of the search: residual, its tolerance, number of steps, and the change of K by its square root, 0 where
+    no root was needed.
+    """
 
     residual: Scalar
     """Infinite if a `hasty` search ended without measuring it; `residual_of` then computes it."""
@@ -65,12 +67,14 @@ def find(
     max_steps: int,
     hasty: bool | Bool[Array, ""] = False,
 ) -> tuple[Vector, Vector, Found]:
-    """Find the cavity means and variances at the fixed point. `start`: weights, cavities, or None.
+    """Search for the cavity means and variances (n,) at the fixed point; returns them and the record of the search.
 
-    A `hasty` search omits the last evaluation, which would only confirm that Newton's method has converged.
+    `covariance` K (n, n); `start`: weights (n,), cavities, or None for Laplace's mode. Never raises: the search
+    converged if `residual <= tolerance`. A `hasty` search omits the last evaluation, which would only confirm that
+    Newton's method has converged; its residual is then infinite. No derivatives.
 
     Under `vmap` the problems are solved one by one on CPUs, each stopping when it has converged; elsewhere all at once,
-    with a root of K.
+    with a root of K, from weights or cavities `start` or else the prior, never hasty.
     """
     arrays, rest = eqx.partition(terms, eqx.is_array)
 
@@ -116,6 +120,7 @@ class _PointTerms(eqx.Module):
     terms: Tilted
 
     def __call__(self, eta: Vector) -> tuple[Vector, Vector, Vector]:
+        """Log likelihoods, slopes and precisions (n,) of the terms at latent values `eta` (n,)."""
         return self.terms(eta, jnp.zeros_like(eta))
 
 
@@ -128,7 +133,11 @@ def _search(
     changed: Scalar,
     hasty: Bool[Array, ""],
 ) -> tuple[Vector, Vector, Found]:
-    """Iterate from the `initial` means and variances to the fixed point; `changed` is passed to the record."""
+    """Iterate from the `initial` means and variances (n,) to the fixed point, or for at most `max_steps` steps.
+
+    Returns means, variances and the record of the search, in which `changed` is passed through; a `hasty` search that
+    omitted its last evaluation has the residual inf. `root`: of K, or None to do without.
+    """
     largest = jnp.asarray(jnp.inf, covariance.dtype)
     count = jnp.zeros((), jnp.int32)
     basin = jnp.full_like(largest, _BASIN)
@@ -151,9 +160,9 @@ def _search(
 def _initial_without_root(
     terms: Tilted, covariance: Matrix, start: Vector | Cavities | None
 ) -> tuple[tuple[Vector, Vector], Int[Array, ""]]:
-    """Initial cavities for the search without a root, at Laplace's mode without a start.
+    """Initial cavity means and variances (n,) for the search without a root, and the number of steps taken for them.
 
-    And the number of steps taken.
+    From `start`; if that is None or holds no start, at Laplace's mode, which is searched in at most 20 steps.
     """
 
     def from_mode():
@@ -172,7 +181,11 @@ def _initial_without_root(
 def _initial(
     terms: Tilted, covariance: Matrix, root: Matrix | None, start: Vector | Cavities | None
 ) -> tuple[Vector, Vector]:
-    """Initial cavities: the prior's; or those around the mean K start, with the sites' precisions at that mean."""
+    """Initial cavity means and variances (n,), by `start`.
+
+    None: mean 0 and the prior variances. Cavities: these, or the former if they are no start. Weights (n,): cavities
+    around the mean K `start`, with the sites' precisions there.
+    """
     prior = jnp.diagonal(covariance)
     if start is None:
         return jnp.zeros_like(prior), prior
@@ -187,7 +200,12 @@ def _initial(
 
 
 def _advance(terms: Tilted, covariance: Matrix, root: Matrix | None, search: _State) -> _State:
-    """One step of the search: evaluate the mismatch of the cavities, then take a Newton step or a damped update."""
+    """One step of the search: evaluate the mismatch of the cavities in the state, then take a Newton step or a damped
+    update.
+
+    Residual and tolerance of the new state are those of the cavities before the step. A Newton step that failed to
+    halve the mismatch is not undone, but narrows the region in which the next is tried.
+    """
     m, v = search.mean, search.variance
     sites = sites_of(terms, m, v)
     posterior = joint_of(covariance, root, sites.precision)
@@ -223,7 +241,9 @@ def _advance(terms: Tilted, covariance: Matrix, root: Matrix | None, search: _St
 
 
 class _Means(NamedTuple):
-    """Tilted means, their natural parameters a + t·mean, and the means of the joint posterior."""
+    """Means (n,) of the tilted distributions, their natural parameters a + t·mean, and the means of the joint
+    posterior.
+    """
 
     tilted: Vector
     natural: Vector
@@ -233,7 +253,9 @@ class _Means(NamedTuple):
 def _mismatch(
     covariance: Matrix, root: Matrix | None, search: _State, sites: Sites, posterior: Joint, means: _Means
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Residual and tolerance of the worse of mean and variance; mismatch (posterior sds) that controls the search."""
+    """Residual and tolerance of the worse of mean and variance; and the mismatch that controls the search, the larger
+    of the largest difference of means in posterior standard deviations and the largest log ratio of variances; scalars.
+    """
     tilted, natural, matched = means
     mean_gap = jnp.where(sites.precision > 0, jnp.abs(matched - tilted), 0.0)
     ratio = posterior.variance / (posterior.left * search.variance)
@@ -257,10 +279,11 @@ def residual_of(
     precision: Vector,
     posterior: tuple[Vector, Callable[[Vector], Vector]],
 ) -> Scalar:
-    """Residual of these cavities, as the search would compute it.
+    """Residual of these cavities, as the search would compute it, a scalar.
 
-    `posterior`: its variances, and a function that multiplies by C. With P = I - K C the means differ by P (K a - m - v
-    a), and the cavities' variances should be s / (1 - t s).
+    `weights`, `precision` (n,): slopes and precisions of the sites; `posterior`: its variances (n,), and a function
+    that multiplies by C. With P = I - K C the means differ by P (K a - m - v a), and the cavities' variances should be
+    s / (1 - t s). The larger of both mismatches counts.
     """
     variance, multiply_by_C = posterior
     tilted = cavities.mean + cavities.variance * weights
@@ -273,7 +296,7 @@ def residual_of(
 def _newton_step(
     sites: Sites, posterior: Joint, variance: Vector, mean_gap: Vector, variance_gap: Vector
 ) -> tuple[Vector, Vector]:
-    """Newton step (dm, dv) that closes the gaps of means and cavity variances to first order.
+    """Newton step (dm, dv), (n,) each, that closes the gaps of means and cavity variances to first order.
 
     dm = W dv + (1 + v t) mean_gap,      J dv = variance_gap - Q (dt/dm (1 + v t) mean_gap).
     """

@@ -30,7 +30,10 @@ class Sites(eqx.Module):
 
 
 def sites_of(terms: Tilted, mean: Vector, variance: Vector) -> Sites:
-    """Sites for the given cavities, from one linearisation of the terms."""
+    """Slopes, precisions and their derivatives for the given cavities, from one linearisation of the terms.
+
+    `mean`, `variance` (n,): of the cavities.
+    """
     (_, slope, precision), push = jax.linearize(terms, mean, variance)
     ones, zeros = jnp.ones_like(mean), jnp.zeros_like(mean)  # the terms are independent, so one tangent suffices
     _, _, precision_m = push(ones, zeros)
@@ -39,7 +42,9 @@ def sites_of(terms: Tilted, mean: Vector, variance: Vector) -> Sites:
 
 
 class Joint(eqx.Module):
-    """Gaussian posterior of all latent values, from prior and sites."""
+    """Gaussian posterior of all latent values: covariance S = (K^-1 + T)^-1 (n, n), its diagonal s (n,), and `left`
+    (n,), 1 - t s, which is posterior over cavity variance.
+    """
 
     covariance: Matrix  # S = (K^-1 + T)^-1
     variance: Vector
@@ -47,7 +52,10 @@ class Joint(eqx.Module):
 
 
 def joint_of(covariance: Matrix, root: Matrix | None, precision: Vector) -> Joint:
-    """Joint posterior S = G'G with L G = R', LL' = I + R'TR; without the root R, S = K - K C K."""
+    """Joint posterior from prior covariance K (n, n) and site precisions t (n,).
+
+    With a root R of K: S = G'G with L G = R', LL' = I + R'TR; without (`root` None): S = K - K C K, less accurate.
+    """
     if root is None:
         scale, _, lower = factorise(covariance, precision)
         through = solve_lower(lower, scale[:, None] * covariance)
@@ -61,10 +69,11 @@ def joint_of(covariance: Matrix, root: Matrix | None, precision: Vector) -> Join
 
 
 def coupling(sites: Sites, posterior: Joint, variance: Vector) -> tuple[Matrix, Matrix, Matrix]:
-    """Matrices W, Q and J of Newton's step.
+    """Matrices W, Q and J of Newton's step, (n, n) each.
 
     W: derivative of the means by the cavity variances; Q: of these by the precisions; J = I + Q (dt/dv + dt/dm W). The
     means' equation has the inverse diag(1 + v t) (I - S T); dv_i = -(s_i / left_i s_i)^2 sum_{j != i} S_ij^2 dt_j.
+    `variance` (n,): of the cavities.
     """
     eye = jnp.eye(variance.shape[0], dtype=variance.dtype)
     from_slopes = posterior.covariance * sites.slope_v[None, :]
@@ -79,5 +88,5 @@ def coupling(sites: Sites, posterior: Joint, variance: Vector) -> tuple[Matrix, 
 
 @one_at_a_time
 def solve(matrix: Matrix, right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Solve `matrix` X = `right` by elimination."""
+    """Solve `matrix` X = `right` by elimination: (n, n), (n, ...) -> (n, ...). A singular matrix gives inf or NaN."""
     return jnp.linalg.solve(matrix, right)

@@ -62,7 +62,11 @@ class SamplingCertificate(eqx.Module):
 
 
 class ExactPosterior(eqx.Module):
-    """Moments of p(f | responses) in the form of the other posteriors, and the samples behind them."""
+    """Moments of p(f | responses) in the form of the other posteriors, and the samples behind them.
+
+    `mode` (n,) is the posterior mean at the tested points; `samples` (n, R, B): x in R replicates of B samples, with
+    the weights `shares` (R, B), which sum to 1.
+    """
 
     mode: Vector
     """Posterior mean of the latent values at the observed points."""
@@ -81,7 +85,7 @@ class ExactPosterior(eqx.Module):
     def expectation(
         self, of: Callable[[Scalar, Scalar], Float[Array, "*out"]], cross: Vector, prior_variance: Scalar
     ) -> tuple[Float[Array, "*out"], Float[Array, "*out"]]:
-        """Posterior expectation of a function of f* and its standard error.
+        """Posterior expectation of a function of f* and its Monte Carlo standard error, of the function's shape.
 
         **Arguments:** `of`: mean and variance of a normal f* -> its expectation under that normal; `cross` (n,) and
         `prior_variance`: prior covariances of f* with the latent values, and its own variance.
@@ -93,9 +97,9 @@ class ExactPosterior(eqx.Module):
         return _weighted(self.shares, values)
 
     def moment_errors(self, cross: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Standard errors of the posterior means and variances at m points.
+        """Monte Carlo standard errors of the posterior means and variances at m points.
 
-        `cross` (n, m): covariances of the observed and the new points -> (m,), (m,).
+        `cross` (n, m): prior covariances of the tested and the new points -> (m,), (m,).
         """
 
         def one(along):
@@ -108,7 +112,8 @@ class ExactPosterior(eqx.Module):
     def draw(
         self, key: PRNGKeyArray, cross: Float[Array, "n m"], prior: Float[Array, "m m"], count: int
     ) -> Float[Array, "count m"]:
-        """Independent exact draws of the latent function at m points; NaN if the tilting was not found.
+        """Independent exact draws (count, m) of the latent function at m points, by rejection; all NaN if the tilting
+        was not found, and NaN for draws not filled after 1000 rounds of proposals.
 
         `cross` (n, m) and `prior` (m, m) are prior covariances with the latent values and among the m points.
         """
@@ -137,9 +142,11 @@ def exact(
     - `key`: another key gives other samples, hence another error of the stated size.
     - `covariance`: K, (n, n), of any rank.
     - `lower`, `upper`: edges (n,), infinite at the ends.
+    - `noise`: standard deviation of the noise, a scalar; `answered` (n,): False in rows without a response.
     - `samples`: total number, a power of 2 times 32. The error falls slightly less than in proportion to it.
 
-    **Returns:** an [`ExactPosterior`][]. It has no derivatives: differentiating it raises `InputError`.
+    **Returns:** an [`ExactPosterior`][]; read `certificate.converged`. It has no derivatives: differentiating it raises
+    `InputError`.
     """
     box = ordered_box(covariance, lower, upper, noise, answered)
     tilt = tilting(box)
@@ -165,16 +172,17 @@ def exact(
 
 @exact.def_jvp
 def _exact_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> NoReturn:
-    """Refuse differentiation: raise `InputError`."""
+    """Refuse differentiation: always raise `InputError`."""
     raise InputError('inference "exact" is sampled and has no derivatives; use "ep" where they are needed.')
 
 
 def _narrowed(
     x: Float[Array, "n R B"], shares: Float[Array, "R B"], mean: Vector, answered: Bool[Array, " n"]
 ) -> tuple[Matrix, Scalar]:
-    """Root of I - Cov[x], and the largest eigenvalue of Cov[x] - I, clipped at 0.
+    """Root (n, n) of I - Cov[x], and the largest eigenvalue of Cov[x] - I, clipped at 0, a scalar.
 
-    The box is convex, so that any positive part is sampling error.
+    The box is convex, so that any positive part is sampling error; the root is computed without it. Rows without a
+    response count as 0.
     """
     centred = x - mean[:, None, None]
     lessened = jnp.diag(answered.astype(x.dtype)) - jnp.tensordot(centred * shares[None], centred, [(1, 2), (1, 2)])
@@ -192,7 +200,10 @@ def _certificate(
     excess: Scalar,
     rounding: Scalar,
 ) -> SamplingCertificate:
-    """Certificate of the samples; `excess`: excess of a sampled variance over 1; `rounding` of the log evidence."""
+    """Certificate of the samples `x` with the weights `shares`.
+
+    `excess`: excess of a sampled variance over 1; `rounding`: rounding error of the log evidence.
+    """
     total = jnp.sum(shares, axis=1)
     log_error = jnp.hypot(jnp.std(total, ddof=1) / jnp.mean(total) / total.shape[0] ** 0.5, rounding)
     latent = jnp.moveaxis(x, 0, -1) @ (box.half @ covariance)
@@ -214,7 +225,9 @@ def _certificate(
 def _checked_resolution(
     certificate: SamplingCertificate, covariance: Matrix, half: Matrix, answered: Bool[Array, " n"]
 ) -> SamplingCertificate:
-    """Certificate set to not converged if rounding hides the variance of an observed value given z (about noise^2)."""
+    """The certificate; with an infinite residual and not converged if rounding hides the variance of an observed value
+    given z (about noise^2). `half` (n, n): L^-1.
+    """
     prior = jnp.diagonal(covariance)
     variance = prior - jnp.sum((half @ covariance) ** 2, axis=0)
     resolution = jnp.finfo(prior.dtype).eps * prior.shape[0] ** 0.5 * jnp.max(prior)
@@ -226,7 +239,10 @@ def _checked_resolution(
 def _weighted(
     shares: Float[Array, "R B"], values: Float[Array, "R B *out"]
 ) -> tuple[Float[Array, "*out"], Float[Array, "*out"]]:
-    """Weighted mean of `values` (R, B, ...) and its standard error, from the replicates, as of a ratio of two means."""
+    """Weighted mean of `values` (R, B, ...) and its standard error, (...) each, as of a ratio of two means.
+
+    The error comes from the differences between the R replicates. `shares` (R, B) sum to 1.
+    """
     weight = shares.reshape(shares.shape + (1,) * (values.ndim - 2))
     numerator = jnp.sum(weight * values, axis=1)
     mean = jnp.sum(numerator, axis=0)

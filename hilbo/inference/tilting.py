@@ -21,7 +21,11 @@ __all__ = ["Box", "Tilt", "accepted", "ordered_box", "propose", "tilting"]
 
 
 class Box(eqx.Module):
-    """Box in x with ordered variables; edges and `below` (L without its diagonal) are in units of L's diagonal."""
+    """Box in x with ordered variables; edges and `below` (L without its diagonal) are in units of L's diagonal.
+
+    `half` is L^-1, its columns in the caller's order, its rows 0 for rows without a response; `answered` is in the
+    order of the box.
+    """
 
     lower: Vector
     upper: Vector
@@ -32,7 +36,9 @@ class Box(eqx.Module):
 
 
 class Tilt(eqx.Module):
-    """Saddle point of psi: the tilting that minimises the variation of the weights."""
+    """Saddle point of psi: `mu`, the tilting that minimises the variation of the weights; `highest`, the upper bound
+    psi* of psi(x, mu); norm of the gradient at the end, near 0 if the search converged; and number of steps.
+    """
 
     mu: Vector
     highest: Scalar
@@ -51,7 +57,11 @@ class _Ordering(NamedTuple):
 
 
 def ordered_box(covariance: Matrix, lower: Vector, upper: Vector, noise: Scalar, answered: Bool[Array, " n"]) -> Box:
-    """Box with its variables in greedy order: next the least probable interval given the expected earlier values."""
+    """Box with its variables in greedy order: next the least probable interval given the expected earlier values.
+
+    `covariance` K (n, n); `lower`, `upper` (n,): edges of f + noise; `noise`: its standard deviation. Rows without a
+    response come last and are unbounded.
+    """
     n = covariance.shape[0]
     both = answered[:, None] & answered[None, :]
     matrix = jnp.where(both, covariance, 0.0) + jnp.diag(jnp.where(answered, noise**2, 1.0))
@@ -87,7 +97,9 @@ def ordered_box(covariance: Matrix, lower: Vector, upper: Vector, noise: Scalar,
 def _intervals(
     mean: Float[Array, "*n"], lower: Float[Array, "*n"], upper: Float[Array, "*n"], answered: Bool[Array, "*n"]
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """`confined_normal` of every variable; all 0 for rows without a response."""
+    """Log mass of N(mean, 1) between `lower` and `upper`, and shift of the mean and reduction of the variance by
+    truncation; elementwise, all 0 for rows without a response.
+    """
     lower = jnp.where(answered, lower, 0.0)
     log_mass, shift, curvature = jnp.vectorize(confined_normal, signature="(),(),()->(),(),()")(
         mean, lower, jnp.where(answered, upper, jnp.inf)
@@ -110,7 +122,7 @@ class _Saddle(eqx.Module):
 
 
 def tilting(box: Box, max_steps: int = 100) -> Tilt:
-    """Find the saddle point of psi by Newton's method.
+    """Search for the saddle point of psi by Newton's method, in at most `max_steps` steps; never raises.
 
     A step is shortened until the simplified step that would follow, by the same matrix, is shorter: a test that is
     invariant to the units of x and mu, which conflicting repeats stretch by sd / noise (Deuflhard 2011, 3.3).
@@ -135,7 +147,7 @@ def tilting(box: Box, max_steps: int = 100) -> Tilt:
 
 
 def _expected(box: Box) -> Vector:
-    """Initial x without tilting: each coordinate at its expected value given the earlier ones, inside the box."""
+    """Initial x (n,) without tilting: each coordinate at its expected value given the earlier ones, inside the box."""
 
     def one(x, k):
         shift = box.below[k] @ x
@@ -146,7 +158,7 @@ def _expected(box: Box) -> Vector:
 
 
 def _saddle(box: Box, x: Vector, mu: Vector) -> _Saddle:
-    """psi, its gradient in x and in mu, and Newton's step, at a point."""
+    """Iterate at the point `x`, `mu` (n,): psi, its gradient in x and in mu, and Newton's step; its step count is 0."""
     shift = box.below @ x + mu
     log_mass, mean, curvature = _intervals(shift, box.lower, box.upper, box.answered)
     a, b = box.below.T @ mean - mu, mu - x + mean
@@ -162,7 +174,7 @@ def _saddle(box: Box, x: Vector, mu: Vector) -> _Saddle:
 
 @one_at_a_time
 def _solve(matrix: Matrix, right: Vector) -> Vector:
-    """Solve a linear system by elimination."""
+    """Solve a linear system by elimination: (n, n), (n,) -> (n,). A singular matrix gives inf or NaN."""
     return jnp.linalg.solve(matrix, right)
 
 
@@ -170,9 +182,9 @@ def _solve(matrix: Matrix, right: Vector) -> Vector:
 
 
 def propose(box: Box, mu: Vector, uniform: Float[Array, "n N"]) -> tuple[Float[Array, "n N"], Float[Array, " N"]]:
-    """Draw x (n, N) from the tilted sequence of truncated normals; also return psi (N,).
+    """Draw N samples x (n, N) from the tilted sequence of truncated normals; also return psi (N,).
 
-    `uniform`: uniform numbers (n, N).
+    `mu` (n,): the tilting; `uniform` (n, N): numbers between 0 and 1 that determine the draws.
     """
     n, count = uniform.shape
 
@@ -190,11 +202,12 @@ def propose(box: Box, mu: Vector, uniform: Float[Array, "n N"]) -> tuple[Float[A
 def _confined(
     uniform: Float[Array, " N"], lower: Float[Array, " N"], upper: Float[Array, " N"]
 ) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
-    """Quantile of a standard normal truncated to (lower, upper), and log of the probability of that interval.
+    """Quantile of a standard normal truncated to (lower, upper), and log of the probability of that interval; (N,)
+    each.
 
-    Reflected so that lower + upper >= 0. With Q the upper tail and R = Q(high) / Q(low), the quantile t has Q(t) =
-    Q(low) (1 - u (1 - R)): by the inverse normal distribution near the centre, by Newton's method in log Q (three steps
-    from a Rayleigh quantile) beyond 3.
+    `uniform` (N,): levels of the quantile, 0 to 1. Reflected so that lower + upper >= 0. With Q the upper tail and R =
+    Q(high) / Q(low), the quantile t has Q(t) = Q(low) (1 - u (1 - R)): by the inverse normal distribution near the
+    centre, by Newton's method in log Q (three steps from a Rayleigh quantile) beyond 3.
     """
     mirrored = lower + upper < 0
     low, high = jnp.where(mirrored, -upper, lower), jnp.where(mirrored, -lower, upper)
@@ -231,9 +244,10 @@ class _Draws(NamedTuple):
 
 
 def accepted(key: PRNGKeyArray, box: Box, tilt: Tilt, count: int) -> Float[Array, "count n"]:
-    """Draw `count` independent x (count, n) by rejection sampling with acceptance probability exp(psi - psi*).
+    """Draw `count` independent x by rejection sampling with acceptance probability exp(psi - psi*): (count, n).
 
-    NaN if the tilting has not converged, and for rows not filled after 1000 rounds.
+    All NaN if the tilting has not converged; NaN in rows not filled after 1000 rounds. Coordinates of rows without a
+    response are 0, in the order of the box.
     """
     n, batch = box.lower.shape[0], 2 * count
     tilted = tilt.gradient <= 1e-3

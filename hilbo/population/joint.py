@@ -1,17 +1,19 @@
 """The committee machine with full covariances on a set of points: joint draws of the population map.
 
-Pointwise, the committee knows a mean and a variance at each point; where the optimum lies takes the covariances too:
+Pointwise, the committee machine gives a mean and a variance at each point; the distribution of the optimum's location
+needs the covariances too:
 
     S^-1 = sum_j S_j^-1 - (M - 1) K^-1,      S^-1 mu = sum_j S_j^-1 mu_j,
 
-S_j the posterior covariance of person j at all m points and K the prior's. With K = R R' everything is said of v,
-f = R v, whose prior is standard normal: B_j = R^-1 K(x, x_j), person j's mean of v is B_j a_j and its covariance
-I - B_j V_j' V_j B_j'. With G_j = V_j B_j' the person adds the precision G_j' (I - G_j G_j')^-1 G_j, of rank n_j and
-never a difference. Directions of K below its rounding (eps m times the largest eigenvalue) are left out: they hold
-less than sqrt(eps m) of the prior's standard deviation at any point.
+S_j the posterior covariance of participant j at all m points and K the prior's. With K = R R' it is computed in v, f =
+R v, whose prior is standard normal: B_j = R^-1 K(x, x_j), participant j's mean of v is B_j a_j and its covariance I -
+B_j V_j' V_j B_j'. With G_j = V_j B_j' the participant adds the precision G_j' (I - G_j G_j')^-1 G_j, of rank n_j and
+never a difference. Directions of K below its rounding (eps m times the largest eigenvalue) are left out: they
+contribute less than sqrt(eps m) of the prior's standard deviation at any point.
 
-At one point this is `bcm.combine`; at several it is not the same map, because a committee of vectors trusts an expert
-in the directions that the expert knows. Reference: Tresp (2000), Neural Computation 12:2719, section 3.
+At one point this is `bcm.combine`; at several it is not the same map, because a committee of vectors weights each
+participant in the directions in which that participant's posterior is precise. Reference: Tresp (2000), Neural
+Computation 12:2719, section 3.
 """
 
 import equinox as eqx
@@ -28,14 +30,14 @@ __all__ = ["JointMap", "joint_map", "posterior_map"]
 
 
 class JointMap(eqx.Module):
-    """The population map at m points as one Gaussian, N(mean, root root')."""
+    """The population map at m points as one Gaussian, N(mean, root root'); `mean` (m,), `root` (m, r)."""
 
     mean: Float[Array, " m"]
     root: Float[Array, "m r"]
 
     @property
     def variance(self) -> Float[Array, " m"]:
-        """Of the map at each point, (m,)."""
+        """Variance of the map at each point, (m,): the squared rows of `root` summed."""
         return jnp.sum(self.root**2, axis=1)
 
     def draw(self, key: PRNGKeyArray, count: int) -> Float[Array, "count m"]:
@@ -44,7 +46,10 @@ class JointMap(eqx.Module):
         return self.mean[None, :] + noise @ self.root.T
 
     def optima(self, key: PRNGKeyArray, count: int, block: int = 256) -> Float[Array, " m"]:
-        """Share of `count` draws (rounded up to blocks) whose largest value is at each point, (m,)."""
+        """Share of draws of the map whose maximum is at each point, (m,); the shares sum to 1.
+
+        `count`: number of draws, rounded up to a multiple of `block`, of which so many are in memory at a time.
+        """
         blocks = -(-count // block)
 
         def add(total, key):
@@ -57,9 +62,10 @@ class JointMap(eqx.Module):
 
 @program
 def joint_map(posteriors: Posterior, x: Float[Array, "m d"]) -> JointMap:
-    """Committee of stacked posteriors (of `fit` under `vmap`, one prior for all) at points (m, d) of the unit cube.
+    """Committee machine's joint map at points (m, d) of the unit cube, from stacked posteriors of one prior.
 
-    The cost is that of an eigendecomposition of m x m, and 25 m^2 a person; m of 1,000 is a second.
+    `posteriors`: of `fit` under `vmap`; the kernel of the first one is taken for all. The cost is that of an
+    eigendecomposition of m x m, and 25 m^2 for each participant; m of 1,000 takes a second.
     """
     kernel = jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel
     root, whitener = _roots(gram(kernel, x, x))
@@ -84,7 +90,10 @@ def joint_map(posteriors: Posterior, x: Float[Array, "m d"]) -> JointMap:
 
 
 def _roots(covariance: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Float[Array, "m m"]]:
-    """R with R R' = K and its pseudo-inverse, both m x m, with zeros for the directions that are left out."""
+    """R with R R' = K and its pseudo-inverse, both (m, m).
+
+    The columns of R for eigenvalues below rounding are 0, and so are the pseudo-inverse's rows.
+    """
     eigenvalues, vectors = eigh(covariance)
     size = covariance.shape[0]
     kept = eigenvalues > jnp.finfo(covariance.dtype).eps * size * eigenvalues[-1]
@@ -95,7 +104,7 @@ def _roots(covariance: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Float[
 
 @program
 def posterior_map(posterior: Posterior, x: Float[Array, "m d"]) -> JointMap:
-    """One posterior at points (m, d) as a joint Gaussian: of the hierarchical model's shared function, say."""
+    """One posterior at points (m, d) as a joint Gaussian, such as that of the hierarchical model's shared function."""
     kernel = posterior.gp.kernel
     cross = gram(kernel, posterior.trials.x, x)
     explained_root = posterior.latent.factor @ cross

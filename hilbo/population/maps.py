@@ -1,14 +1,15 @@
-"""A cohort's population map by any rule, as one record that predicts; and what the answers say of how people differ.
+"""The population map of a cohort by any aggregation method, as one record that predicts; and the share of the prior
+variance that participants have in common.
 
-Rules of `pointwise` aggregate everybody's own posterior point by point. Two rules look at the answers themselves:
+Methods of `pointwise` combine the individual posteriors point by point. Others use the responses themselves:
 
-* `hierarchical`, where the answers are few enough: the posterior of the shared function g, exact (`shared`); point by
-  point otherwise, at the committee's cost.
-* `pooled`: one function for all.
-* `learnt-1`, `learnt-2`: hierarchical, with hyperparameters that are learnt from the answers as well (`learnt`).
+- `hierarchical`, where the responses are few enough: the posterior of the shared function g, exact (`shared`); point by
+  point otherwise, at the committee machine's cost.
+- `pooled`: one function for all participants.
+- `learnt-1`, `learnt-2`: hierarchical, with hyperparameters that are learnt from the responses as well (`learnt`).
 
-The share that people have in common is learnt by evidence, from an even choice of people if there are many, and its
-posterior mean is used: the most probable share may be 0 or 1, where nothing, or everything, would be common.
+The share is learnt by evidence, from evenly spaced participants if there are many, and its posterior mean is used: the
+most probable share may be 0 or 1, where nothing, or everything, would be common.
 """
 
 import equinox as eqx
@@ -51,7 +52,12 @@ _SHARE = 600  # answers from which the share is learnt
 
 
 class RuleMap(eqx.Module):
-    """The population map by one rule: predicts at points of the unit cube."""
+    """The population map by one aggregation method (`rule`): predicts at points of the unit cube.
+
+    `method` is "by points" for a map combined from the stacked individual posteriors `experts`, or "exact" for the
+    posterior `shared` of the shared function, from all responses at once; the other one is None. `share`: fraction of
+    `prior`, the prior variance of one participant's function, that participants have in common.
+    """
 
     rule: str = eqx.field(static=True)
     method: str = eqx.field(static=True)
@@ -81,7 +87,7 @@ class RuleMap(eqx.Module):
         return f"RuleMap({self.rule}, {self.method}{people})"
 
     def predict(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of the map at points (m, d)."""
+        """Mean and variance (m,) of the map at points (m, d) of the unit cube, without individual differences."""
         if self.method == "exact":
             assert self.shared is not None
             return self.shared.predict(x)
@@ -91,19 +97,24 @@ class RuleMap(eqx.Module):
         )
 
     def astype(self, dtype: DTypeLike) -> "RuleMap":
-        """The same map that predicts in another precision."""
+        """Copy with all floating-point arrays converted to another float dtype."""
         return jax.tree.map(lambda leaf: leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, self)
 
     @property
     def apart(self) -> Float[Array, ""]:
-        """Variance of one person's function about the map's: only the hierarchical model says that people differ; in a
-        context that nobody was asked in, if there is a random effect."""
+        """Variance of one participant's function about the map, a scalar: (1 - share) times the prior variance, hence 0
+        unless the method is hierarchical.
+
+        With a random effect, the variance that an untested context adds is included.
+        """
         own = (1.0 - self.share) * self.prior
         return own if self.effects is None else own + self.effects.prior
 
     @property
     def map_prior(self) -> Float[Array, ""]:
-        """Variance of the map where nobody answered, against which its own tells what the answers say."""
+        """Variance of the map far from all tested points, a scalar: the prior variance that participants share; for the
+        unweighted average, one participant's prior variance over their number.
+        """
         if not RULES[self.rule].weighted:
             return self.prior / jax.tree.leaves(self.experts)[0].shape[0]
         return self.share * self.prior
@@ -111,8 +122,12 @@ class RuleMap(eqx.Module):
     def newcomer(
         self, x: Float[Array, "m d"], context: Int[Array, " m"] | None = None
     ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of a new person's function, from which answers are predicted; in these contexts, or in
-        new ones."""
+        """Mean and variance (m,) of a new participant's function at points (m, d), which predict that participant's
+        responses.
+
+        `context` (m,): the contexts as indices from 0; None: new contexts, whose effects are not known. It is ignored
+        without a random effect.
+        """
         mean, variance = self.predict(x)
         if self.effects is None or context is None:
             return mean, variance + self.apart
@@ -120,19 +135,25 @@ class RuleMap(eqx.Module):
         return mean + shift, variance + more + (1.0 - self.share) * self.prior
 
     def class_probabilities(self, likelihood: OrdinalProbit, x: Float[Array, "m d"]) -> Float[Array, "m C"]:
-        """Probabilities (m, C) of a new person's answers at points (m, d)."""
+        """Probabilities (m, C) of a new participant's responses at points (m, d), in new contexts."""
         return class_probabilities(likelihood, *self.newcomer(x), self.widths)
 
 
 def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[str, Float[Array, ""] | None]:
-    """By which rule, and with which share, everybody's posteriors are aggregated point by point in place of a map: by
-    the same rule, or by bcm where the rule takes all answers at once; a recipe is the hierarchical one."""
+    """The pointwise method that stands in for `rule` where no map of all responses is fitted, and its share.
+
+    The method is `rule` itself if it is pointwise, "bcm" or "hierarchical" otherwise. The share is None unless that
+    method is hierarchical.
+    """
     by_points = RULES[rule].pointwise
     return by_points, share if RULES[by_points].learns_share else None
 
 
 def learnt_map(learnt: Learnt, trials: Trials) -> RuleMap:
-    """The map by learnt hyperparameters, from stacked trials (M, n)."""
+    """Exact map from stacked trials (M, n), with the hyperparameters of `learnt`, which are not fitted again.
+
+    `reach` becomes the largest variance of the map at a tested point.
+    """
     shared, effects = learnt_function(learnt, trials)
     _, variances = shared.predict(trials.x.reshape(-1, trials.x.shape[-1]))
     reach = jnp.max(jnp.where(trials.mask.reshape(-1), variances, 0.0))
@@ -151,11 +172,17 @@ def rule_map(
     inference: str = "laplace",
     largest: int = LARGEST_EXACT,
 ) -> RuleMap:
-    """The map by a rule of `GIVEN` from stacked trials (M, n).
+    """Fit the map by an aggregation method of `GIVEN` from stacked trials (M, n).
 
-    **Arguments:** `posteriors`: everybody's own, if they are there; `share`: of the hierarchical rule, else learnt by
-    `share_of`; `largest`: exact models are used up to so many latent values. Raises InputError for what a rule cannot
-    do with these answers.
+    **Arguments:**
+
+    - `posteriors`: the individual ones, stacked, if they exist; else fitted here where they are needed.
+    - `share`: of the hierarchical method, else learnt by `share_of`.
+    - `largest`: exact models are used up to so many latent values; beyond it the hierarchical method combines point by
+      point.
+
+    Raises `InputError` for a method that is not in `GIVEN`, without responses, for a share that cannot be learnt, and
+    for "pooled" with more latent values than `largest`.
     """
     if rule not in GIVEN:
         raise InputError(f'rule_map: the rule is "{rule}"; it must be one of {", ".join(GIVEN)}.')
@@ -185,7 +212,11 @@ def rule_map(
 
 
 def share_of(gp: OrdinalGP, trials: Trials, inference: str = "laplace", largest: int = _SHARE) -> Share:
-    """The posterior of the share that people have in common; from an even choice of people where there are many."""
+    """Posterior of the share of the prior variance that participants have in common, from stacked trials (M, n).
+
+    With more than `largest` responses, only evenly spaced participants are used. Exact inference is replaced by
+    expectation propagation. Raises `InputError` if fewer than two participants gave a response.
+    """
     answered = np.flatnonzero(np.asarray(trials.mask).any(axis=1))
     if len(answered) < 2:
         raise InputError(
@@ -197,7 +228,9 @@ def share_of(gp: OrdinalGP, trials: Trials, inference: str = "laplace", largest:
 
 
 def even_rows(trials: Trials, largest: int) -> Int[np.ndarray, " k"]:
-    """Places of all people, or of so many of them, evenly chosen and at least two, that their answers are not more."""
+    """Rows of evenly spaced participants of stacked trials (M, n), in order, so many that on average they gave at most
+    `largest` responses; at least two rows, and all of them if there are not more responses.
+    """
     answers = int(np.asarray(trials.mask).sum())
     people = trials.mask.shape[0]
     count = people if answers <= largest else max(2, int(people * largest / answers))
@@ -205,7 +238,9 @@ def even_rows(trials: Trials, largest: int) -> Int[np.ndarray, " k"]:
 
 
 def _experts(gp: OrdinalGP, trials: Trials, inference: str) -> Posterior:
-    """Everybody's own posterior, stacked; from counts where many answers are at the same points."""
+    """The individual posteriors, stacked, converged or not; with Laplace's method and many repeated points, from counts
+    of responses at each distinct point.
+    """
     if inference == "laplace":
         answers = tallied(trials, gp.likelihood.categories)
         if 2 * answers.x.shape[1] < trials.mask.shape[1]:
@@ -215,18 +250,23 @@ def _experts(gp: OrdinalGP, trials: Trials, inference: str) -> Posterior:
 
 @program
 def _fit_people_from_counts(gp: OrdinalGP, answers: Tallies) -> Posterior:
+    """Laplace posterior of each participant, stacked, from counts of responses at each point; one after the other."""
     return jax.lax.map(lambda person: fit_counts(gp, *person), (answers.x, answers.counts))
 
 
 @program
 def _fit_people_from_trials(gp: OrdinalGP, trials: Trials, inference: str) -> Posterior:
+    """Posterior of each participant, stacked, from trials (M, n), converged or not."""
     return jax.vmap(lambda person: fit(gp, person, inference=inference, throw=False))(trials)
 
 
 def _shared_function(
     gp: OrdinalGP, trials: Trials, share: Float[Array, ""], inference: str, largest: int
 ) -> Posterior | None:
-    """The shared function's posterior from all answers at once; None if they are too many."""
+    """Posterior of the shared function from all responses at once, converged or not; `share`: a scalar.
+
+    None if that costs more than a fit of `largest` latent values, and with exact inference.
+    """
     mask = np.asarray(trials.mask)
     if inference == "laplace" and few_points(trials):
         people, points = int(mask.any(axis=1).sum()), len(np.unique(np.asarray(trials.x)[mask], axis=0))
@@ -241,7 +281,9 @@ def _shared_function(
 
 
 def _pooled(gp: OrdinalGP, trials: Trials, inference: str, largest: int) -> Posterior | None:
-    """One GP on everybody's answers, as if from one person; None if they are too many."""
+    """Posterior of one function from all responses, as if of one participant, converged or not; None if it has more
+    than `largest` latent values.
+    """
     mask = np.asarray(trials.mask)
     everybody = Trials.from_arrays(np.asarray(trials.x)[mask], np.asarray(trials.q)[mask])
     if inference != "laplace":

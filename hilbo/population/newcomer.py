@@ -1,5 +1,8 @@
-"""What a population map predicts of a new person, before any answer and from one answer to the next: that person's own
-function is integrated out, and the width of their middle categories where people differ in it."""
+"""Predicted responses of a new participant from a population map, before any response and in sequence.
+
+The new participant's own function is integrated out, and so is the width of the middle categories where it differs
+between participants.
+"""
 
 from typing import NamedTuple
 
@@ -22,10 +25,11 @@ _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 def class_probabilities(
     likelihood: OrdinalProbit, mean: Float[Array, " m"], variance: Float[Array, " m"], widths: bool = False
 ) -> Float[Array, "m C"]:
-    """Probabilities (m, C) of a new person's answers, from the mean and variance (m,) of that person's function.
+    """Probabilities (m, C) of a new participant's responses, from mean and variance (m,) of that participant's
+    function.
 
-    **Arguments:** `widths`: whether people's distances between thresholds differ, as the recipes' prior says; they are
-    then integrated out by Gauss and Hermite, with 7 nodes.
+    **Arguments:** `widths`: whether the distances between thresholds differ between participants, by the prior of the
+    recipes (log-normal); they are then integrated out by Gauss-Hermite quadrature with 7 nodes.
     """
     if not widths:
         return jax.vmap(likelihood.class_probabilities)(mean, variance)
@@ -40,7 +44,10 @@ def class_probabilities(
 def log_highest(
     likelihood: OrdinalProbit, mean: Float[Array, " m"], variance: Float[Array, " m"], widths: bool = False
 ) -> Float[Array, " m"]:
-    """The log probability (m,) of the highest category, as accurate where it is small; arguments as above."""
+    """Log probability (m,) of the highest category, accurate also where it is small.
+
+    Arguments as for `class_probabilities`.
+    """
     spread = jnp.sqrt(likelihood.noise**2 + variance)
     if not widths:
         return log_ndtr((mean - likelihood.thresholds[-1]) / spread)
@@ -50,7 +57,11 @@ def log_highest(
 
 
 class InTurn(NamedTuple):
-    """Predictions of n answers, each from those before it."""
+    """Predictions of n responses, each from those before it.
+
+    `probabilities` (n, C); `log_given` (n,): log probability of the response that was given, finite also where the
+    probability underflows.
+    """
 
     probabilities: Float[Array, "n C"]
     log_given: Float[Array, " n"]
@@ -65,14 +76,17 @@ def predicted_in_turn(
     mask: Bool[Array, " n"],
     widths: bool = False,
 ) -> InTurn:
-    """A new person's answers one after the other, each predicted from those before it.
+    """Predict a new participant's n responses one after the other, each from those before it.
 
-    A session chooses renderings by what its participant said before. The people who are asked at a rendering are then
-    not a random choice, and only a prediction that knows their earlier answers can be right. The person's function at
-    the n renderings is normal with `mean` and `covariance` before any answer. Each answer q that was given (`mask`)
-    changes both to the moments of what follows from it (assumed density filtering), in O(n^3) for all answers.
-    `widths` as above: they are weighted by how probable they made the answers so far.
-    Reference: Dawid (1984), J. R. Statist. Soc. A 147:278, for such predictions; Opper (1998), On-line Learning in
+    The participant's function at the n points is normal with `mean` (n,) and `covariance` (n, n) before any response.
+    Each response `q` (n,) that was given (`mask`, (n,)) updates both (assumed density filtering), in O(n^3) for all
+    responses; one that was not given changes nothing. `widths` as for `class_probabilities`: their nodes are weighted
+    by the probability of the responses so far.
+
+    A session chooses stimuli by what its participant responded before. The participants tested at a stimulus are then
+    not a random sample, and only a prediction that uses their earlier responses can be calibrated.
+
+    References: Dawid (1984), J. R. Statist. Soc. A 147:278, for such predictions; Opper (1998), On-line Learning in
     Neural Networks, ch. 16, for the filter.
     """
 
@@ -97,10 +111,12 @@ def in_turn(
     mask: Bool[Array, " n"],
     lapse: ArrayLike = 0.0,
 ) -> InTurn:
-    """The same with fixed thresholds, where the share `lapse` of the answers is any category at random. Both are then
-    the moments of a mixture, of what the answer says and of what was known before; an unlikely answer changes little.
+    """`predicted_in_turn` with fixed thresholds, where the share `lapse` of the responses is any category at random.
 
-    The change of the covariance is a sum of outer products of rows, one for each answer, so that an answer costs a
+    Each update then has the moments of a mixture of the updated and the unchanged distribution; an unlikely response
+    changes little. Shapes (n,) and (n, n) as there.
+
+    The change of the covariance is a sum of outer products of rows, one for each response, so that a response costs a
     matrix times a vector.
     """
     lapse, categories = jnp.asarray(lapse, mean.dtype), likelihood.categories
@@ -124,9 +140,11 @@ def in_turn(
 
 
 def _log_widths(like: Array) -> Float[Array, " nodes"]:
+    """Nodes (7,) of Gauss-Hermite quadrature for the log width of the middle categories, in the dtype of `like`."""
     return WIDTHS.mean + WIDTHS.sd * jnp.asarray(_NODES, like.dtype)
 
 
 def _widened(likelihood: OrdinalProbit, log_width: Float[Array, ""]) -> Float[Array, " edges"]:
+    """Thresholds (C - 1,) with their distances from their mean multiplied by exp(log_width)."""
     middle = jnp.mean(likelihood.thresholds)
     return middle + jnp.exp(log_width) * (likelihood.thresholds - middle)

@@ -1,20 +1,20 @@
-"""The rules by which participants' posteriors become one population map, as one family of sums over people.
+"""Aggregation methods that combine participants' posteriors point by point, as one family of sums over participants.
 
-At a point with prior variance k let person j's posterior have mean m_j and variance k - e_j, e_j >= 0 being what the
-answers explain. Every rule but the average is one precision-weighted sum over people,
+At a point with prior variance k let participant j's posterior have mean m_j and variance k - e_j, e_j >= 0 being the
+variance that the responses explain. Every method but the average is one precision-weighted sum over participants,
 
     1 / v = 1 / p k + sum_j e_j / (k (k - p e_j)),      mean = v sum_j m_j / (k - p e_j),
 
-    rule          p
+    method        p
     bcm           1
     hierarchical  share
 
-in which a person without answers has e_j = 0 and m_j = 0 and adds nothing. `hierarchical` is the model f_j = g + h_j,
-cov(g) = p k, cov(h_j) = (1 - p) k, point by point: of e_j's precision only a part is about g, since the person's own
-h_j is noise to it. p = 1 is the Bayesian committee machine, which says that people do not differ. `average` is the
-plain mean of the latents, in which everybody counts the same.
+in which a participant without responses has e_j = 0 and m_j = 0 and adds nothing. `hierarchical` is the model f_j = g +
+h_j, cov(g) = p k, cov(h_j) = (1 - p) k, point by point: only a part of e_j's precision is about g, since the
+participant's own h_j is noise to it. p = 1 is the Bayesian committee machine, which assumes that participants do not
+differ. `average` is the plain mean of the latent functions, in which all participants have equal weight.
 
-The sums are made of predictions (`aggregate`), or of posteriors, person by person and on any number of devices
+The sums are made of predictions (`aggregate`), or of posteriors, one participant at a time and on any number of devices
 (`merged`). Reference: Tresp (2000). Products of experts, rbcm and grbcm were better on no population
 (docs/methods/aggregation.md).
 """
@@ -37,7 +37,9 @@ __all__ = ["aggregate", "merged"]
 
 
 class _Sums(NamedTuple):
-    """Sums over people at points (m,)."""
+    """Sums over participants at m points, (m,) each: precision added to the prior, precision-weighted means, means, and
+    explained variances.
+    """
 
     added: Float[Array, " m"]
     """Precision that people add to the prior."""
@@ -49,8 +51,11 @@ class _Sums(NamedTuple):
     def merge(
         self, prior: Float[Array, " m"], people: ArrayLike, rule: str, share: ArrayLike
     ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of the map of so many people with the prior variance `prior`, by the rule that the
-        sums were made for; all of them serve the average."""
+        """Mean and variance (m,) of the population map by the method `rule`.
+
+        `prior` (m,): prior variance; `people`: number of participants, of which only "average" depends; `share`: p, the
+        one with which the sums were made.
+        """
         if not RULES[rule].weighted:
             return self.means / people, (prior - self.explained / people) / people
         common = prior * share
@@ -61,9 +66,10 @@ class _Sums(NamedTuple):
 def _terms(
     means: Float[Array, "*s"], explained: Float[Array, "*s"], prior: Float[Array, "..."], share: ArrayLike
 ) -> _Sums:
-    """What each person adds to the sums; `share`: p, a scalar, 1 for every rule but the hierarchical one.
+    """What participants add to the sums, elementwise: `means` and `explained` of any shape, and the result's fields of
+    the same.
 
-    `means` and `explained` of any shape, and the sums of the same.
+    `prior`: k, broadcast; `share`: p, a scalar, 1 for every method but the hierarchical one.
     """
     remaining = prior - share * explained
     return _Sums(explained / (prior * remaining), means / remaining, means, explained)
@@ -74,8 +80,9 @@ def merged(
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Mean and variance (m,) of the population map at points (m, d) of the unit cube, as `aggregate`, from posteriors.
 
-    `experts`: posteriors of all people, stacked. Their predictions are made one after the other and never held at once,
-    on each of the devices that people are sharded over.
+    `experts`: posteriors of all participants, stacked; `prior_variance`: k, a scalar or (m,); `share`: of the
+    hierarchical method, None for others. Nothing is checked. The predictions of the participants are made one after the
+    other and are never all in memory, on each of the devices that participants are sharded over.
     """
     prior = jnp.broadcast_to(jnp.asarray(prior_variance, x.dtype), x.shape[:1])
     common_share = jnp.ones((), x.dtype) if share is None else jnp.asarray(share, x.dtype)
@@ -86,6 +93,7 @@ def merged(
 def _terms_of_person(
     person: Posterior, x: Float[Array, "m d"], prior: Float[Array, " m"], share: Float[Array, ""]
 ) -> _Sums:
+    """What one participant's posterior adds to the sums at points (m, d); `prior` (m,), `share` a scalar."""
     return _terms(*person.predict_explained(x), prior, share)
 
 
@@ -98,16 +106,17 @@ def aggregate(
     share: ArrayLike | None = None,
     mask: Bool[Array, " M"] | None = None,
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Mean and variance (m,) of the population map, by one of `POINTWISE`.
+    """Mean and variance (m,) of the population map, by one of the methods `POINTWISE`.
 
     **Arguments:**
 
     - `means`, `explained`: posterior means and explained variances e_j = k - sigma_j^2, (M, m).
     - `prior_variance`: k, a scalar or (m,), of all participants.
-    - `share`: p of the hierarchical rule, in (0, 1]: the part of the prior variance that people have in common.
-    - `mask`: (M,), False for absent participants, whose numbers may be anything, NaN too.
+    - `share`: p of the hierarchical method, in (0, 1]: the part of the prior variance that participants have in common;
+      None for others.
+    - `mask`: (M,), False for absent participants, whose numbers may be anything, NaN too; None: all are present.
 
-    Raises InputError for a rule that there is not, and for a share that does not belong to it.
+    Raises `InputError` for an unknown method, for a missing share of the hierarchical one, and for a share of another.
     """
     if rule not in POINTWISE:
         raise InputError(f'aggregate: the rule is "{rule}"; it must be one of {", ".join(POINTWISE)}.')
@@ -129,7 +138,7 @@ def _aggregated(
     share: Float[Array, ""] | None,
     mask: Bool[Array, " M"] | None,
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Of `aggregate`, with arguments that were checked."""
+    """Compiled part of `aggregate`, with checked arguments: mean and variance (m,)."""
     prior = jnp.broadcast_to(prior_variance, means.shape[1:])
     if not RULES[rule].weighted:
         return bcm.average(means, prior[None, :] - explained, mask=mask)

@@ -1,4 +1,4 @@
-"""What pages and the checklist call a covariance, and its formula with its numbers: for each kernel in one place."""
+"""Name and formula of a covariance function, as pages and the checklist print them."""
 
 import numpy as np
 
@@ -12,12 +12,15 @@ _FORMS: dict[type[Stationary], str] = {RBF: f"exp(−{_DISTANCE})", Matern32: f"
 
 
 def covariance_words(kernel: Stationary) -> str:
-    """Such as "Matérn 3/2"."""
+    """Name of a kernel's family in running text: "squared-exponential" or "Matérn 3/2"."""
     return _NAMES[type(kernel)]
 
 
 def formula(kernel: Stationary) -> str:
-    """k(x, x′) of the normalised parameters with the kernel's variance and thetas, as text."""
+    """k(x, x′) of the normalised parameters as text, with the kernel's variance and thetas in four digits.
+
+    For categorical coordinates the text adds that two different levels count as 1 apart.
+    """
     thetas = np.ravel(np.asarray(kernel.theta))
     given = ", ".join(f"{theta:.4g}" for theta in thetas)
     levels = ", where two different levels of a parameter count as 1 apart" if any(kernel.levels) else ""

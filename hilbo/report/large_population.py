@@ -1,6 +1,7 @@
-"""Grid and figures of a map whose every point asks many participants: the grid is coarse, and figures are read from it.
+"""Grid and figures for maps that are expensive to evaluate, since each point needs the fits of many participants.
 
-Figures of progress are left out: each of their points is a fit of everybody.
+The grid is coarse, and the figures are interpolated from it. Figures of progress over trials are left out: each of
+their points is a fit of all participants.
 """
 
 from collections.abc import Callable
@@ -26,12 +27,20 @@ _DOTS = 2000  # individual optima in a figure
 
 
 def coarse_cells(study: Study) -> int:
-    """Cells along each side of a grid of at most 5,000 points."""
+    """Number of grid points along each side: at most 41, so that the grid (of at most 3 dimensions) has at most
+    5,000.
+    """
     return min(_CELLS, int(_POINTS ** (1 / min(study.space.dim, 3))))
 
 
 def figures_of_many(study: Study, aggregate: Aggregate, grid: xr.Dataset) -> tuple[dict[str, Any], dict[str, int]]:
-    """Figures by their names, and how many `participants` and individual `optima` they show. `grid`: of the map."""
+    """Matplotlib figures by name, and how many `participants` and individual `optima` they show.
+
+    `grid`: dataset with `mean` and `variance` of the map on a grid of the unit cube. The map figure shows the responses
+    of at most 200 participants, evenly spaced in their order, and is missing for a space without a grid. The figure of
+    the optima shows at most 2,000; it is missing if individual optima were not computed, and for one parameter. The
+    counts of missing figures are missing too.
+    """
     from hilbo.report.figures import maps
 
     figures, best, drawn = {}, np.asarray(aggregate.optimum.x), {}
@@ -49,13 +58,15 @@ def figures_of_many(study: Study, aggregate: Aggregate, grid: xr.Dataset) -> tup
 
 
 def _some(cohort: Cohort) -> Cohort:
-    """A few participants, evenly chosen."""
+    """At most 200 participants of a cohort, evenly spaced in their order."""
     people = len(cohort.names)
     return cohort.rows(np.unique(np.linspace(0, people - 1, min(people, _DRAWN)).round().astype(int)))
 
 
 def _from(grid: xr.Dataset) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """The map between the grid's points, to what a figure shows: mean and variance at points of the unit cube."""
+    """Map interpolated from its grid (cubic): a function of points (m, d) of the unit cube that returns mean and
+    variance, (m,) each.
+    """
     sides = tuple(np.linspace(0.0, 1.0, count) for count in grid["mean"].shape)
     values = np.stack([grid["mean"].values, grid["variance"].values], axis=-1)
     between = RegularGridInterpolator(sides, values, method="cubic")

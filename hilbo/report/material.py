@@ -1,7 +1,7 @@
 """Results of `hilbo identify` and `hilbo passivity`: result.json, the [renderer] block, figures, a page.
 
-Digits are printed only of parameters that the data identify; elsewhere the table has words. `set` in result.json is
-always there: the numbers of the best curve, which belong together and to their N and T.
+A table shows digits only of identified parameters, and else their status in words. `set` in result.json always has the
+numbers of the best curve, which belong together and to their N and T.
 """
 
 import math
@@ -31,7 +31,13 @@ def identification_result(
     notes: tuple[str, ...],
     damping: float | None,
 ) -> dict[str, Any]:
-    """The content of result.json. `unit`: of the curves; `damping`: the device's, N·s/m."""
+    """The content of result.json of `hilbo identify`, ready for JSON.
+
+    `source`: where the data are from; `unit`: of the curves; `notes`: warnings put before those of the result;
+    `damping`: the device's, N·s/m, None if not known. A parameter that is not identified has the value None; `renderer`
+    is None unless the model is the sampled one; `passivity`, `bootstrap` and `smallest_N` are None where the result has
+    none.
+    """
     model = result.fit.model
     sampled = isinstance(model, Sampled)
     about: dict[str, Any] = {"name": type(model).__name__.lower() if not sampled else "fosls", "unit": unit}
@@ -65,19 +71,26 @@ def identification_result(
 
 
 def _row(row):
+    """Entry of `memory` in result.json for the fit with one memory length: N (None: full memory), NRMSE by test,
+    set.
+    """
     return {"N": row.N, "memory": "full" if row.N is None else "short", "nrmse": row.nrmse, "set": row.fit.parameters()}
 
 
 def _passivity(needed, damping):
+    """Entry `passivity` of result.json: needed damping, the device's damping, and their difference, N·s/m.
+
+    `damping` None (not known): so is the margin.
+    """
     margin = None if damping is None else damping - needed
     return {"minimum_damping": needed, "damping": damping, "margin": margin}
 
 
 def renderer_block(result: Characterisation, damping: float | None) -> str:
-    """The [renderer] table of a study file for this material, as text; the whole set as comments.
+    """The [renderer] table of a study file for this material, as TOML text; the whole parameter set as comments.
 
-    K_eff has its status beside it: the number of the best curve is there even where the data do not tell it.
-    `damping`: the device's, N·s/m; None leaves a line to fill in.
+    The line of K_eff always has the value of the best curve; its status is a comment beside it. `damping`: the
+    device's, N·s/m; None leaves a commented line to fill in. The model must be the sampled one (`Sampled`).
     """
     model, values = result.fit.model, result.fit.parameters()
     lines = ["[renderer]", 'model = "fosls"', f'memory = "{model.memory}"']
@@ -99,7 +112,11 @@ def renderer_block(result: Characterisation, damping: float | None) -> str:
 def write_identification(
     tests: tuple[Test, ...], result: Characterisation, content: dict[str, Any], folder: Path, damping: float | None
 ) -> None:
-    """Write result.json, renderer.toml, curves.csv, the figures and report.html. `damping`: the device's, N·s/m."""
+    """Write the results of `hilbo identify` into an existing folder: result.json, curves.csv, figures, report.html.
+
+    For the sampled model renderer.toml and the figures of its set too. `content`: of `identification_result`;
+    `damping`: the device's, N·s/m; None: the figures are drawn for the damping that the set needs.
+    """
     from hilbo.report.figures import mechanics as plotting
 
     write_result(content, folder)
@@ -124,6 +141,7 @@ def write_identification(
 
 
 def _model(result):
+    """The fitted parameter set as `FOSLS`, with the T and the memory of the fit; for the sampled model."""
     values, model = result.fit.parameters(), result.fit.model
     place = (values[name] for name in ("K0", "K1", "B1", "alpha"))
     if model.memory == "full":
@@ -132,7 +150,9 @@ def _model(result):
 
 
 def _set_figures(model, b, delay=0.0):
-    """Figures of one parameter set on a device."""
+    """Matplotlib figures of one parameter set by name: always "bode"; with a damping `b` (N·s/m) also "passivity" and,
+    for odd N and full memory, "passive-set". `delay`: of the force, s.
+    """
     from hilbo.report.figures import mechanics as plotting
 
     figures = {"bode": plotting.bode_figure(model)}
@@ -144,6 +164,9 @@ def _set_figures(model, b, delay=0.0):
 
 
 def _curves(tests, result, predicted):
+    """The table curves.csv: for each kind of test its times (s), mean of the repeats, their sd if there are several,
+    and the fitted curve. `predicted`: fit and kind of test -> curve.
+    """
     parts = []
     for test in tests:
         columns = {"test": test.kind, "time_s": test.time, "mean": test.output.mean(axis=0)}
@@ -154,7 +177,11 @@ def _curves(tests, result, predicted):
 
 
 def _parameter(name, estimate, bootstrap):
-    """A parameter's value, or why it has none, and its intervals, in as many digits as the data support."""
+    """Row of the page's table for a parameter: its value, or its status if it is not identified; profile interval, and
+    bootstrap interval. All are rounded texts.
+
+    "open" stands for an interval end that is None; an interval is None if there is none.
+    """
     value = _rounded(estimate.value, estimate.lower, estimate.upper) if estimate.known else estimate.status
     ends = [_rounded(end, estimate.lower, estimate.upper) if end is not None else "open" for end in estimate[1:3]]
     resampled = (bootstrap or {}).get(name) if estimate.known else None
@@ -167,7 +194,9 @@ def _parameter(name, estimate, bootstrap):
 
 
 def _rounded(value, lower, upper):
-    """So many digits that the interval shows two."""
+    """A value as text with so many decimals that the width of its interval has two digits; three significant digits for
+    an open or empty interval.
+    """
     if lower is None or upper is None or not upper > lower:
         return f"{value:.3g}"
     decimals = max(0, 1 - math.floor(math.log10(upper - lower)))
@@ -175,7 +204,9 @@ def _rounded(value, lower, upper):
 
 
 def write_passivity(model: FOSLS, content: dict[str, Any], folder: Path) -> None:
-    """Write result.json and the figures of the set, with a page around them."""
+    """Write result.json, the figures of the set and report.html into an existing folder. `content`: of
+    `passivity_result`.
+    """
     write_result(content, folder)
     page = rendered(
         "material.html",

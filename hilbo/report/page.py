@@ -1,4 +1,4 @@
-"""Pages around the numbers of results: Jinja templates of this folder, which hold the words, and their filters."""
+"""HTML and Markdown pages of results, from the Jinja templates of this folder, and the filters of the templates."""
 
 from collections.abc import Iterable
 from functools import cache
@@ -38,12 +38,17 @@ def results_page(
     comparison: Any = None,
     halves: int = 0,
 ) -> str:
-    """The page of an aggregation.
+    """The HTML page of an aggregation.
 
-    **Arguments:** `how`: how maps of fewer trials are aggregated, where it is not as the map is; `drawn`: of a large
-    population, how many `participants` and individual `optima` its figures show; `selection`: how what was asked had
-    been chosen, where that is known; `comparison`: the section of `report.comparison`; `halves`: into
-    how many halves people were split to say how sure the optimum after fewer trials is.
+    **Arguments:**
+
+    - `content`: of result.json; `people`: a row for each participant, of whom the table shows the first 200.
+    - `how`: how maps of fewer trials are aggregated, where it is not as the map is.
+    - `drawn`: of a large population, how many `participants` and individual `optima` its figures show.
+    - `selection`: how the trials had been chosen, where that is known.
+    - `comparison`: the section of `report.comparison`.
+    - `halves`: number of random splits of the participants into halves, from which the uncertainty of the optimum after
+      fewer trials is estimated; 0: none.
     """
     claims = {"aggregate": content["optimum"]} | content["alternatives"]
     if content["mean_of_optima"] is not None:
@@ -67,24 +72,32 @@ def results_page(
 
 
 def estimate_words(name: str, rule: str) -> str:
-    """What an estimate of the optimum is called on pages; `name`: its key in result.json, `rule`: the study's."""
+    """Name of an estimate of the optimum on pages.
+
+    `name`: its key in result.json, where "aggregate" is the map by the study's aggregation method `rule`. Raises
+    `KeyError` for an unknown key.
+    """
     return f"population map ({rule})" if name == "aggregate" else _ESTIMATES[name]
 
 
 def rendered(name: str, **facts: Any) -> str:
-    """The page of a template, which escapes what it is given."""
+    """The HTML of a template; the values `facts` are escaped. Raises an error of Jinja for a name that is missing."""
     return _environment().get_template(name).render(**facts)
 
 
 def text_of(name: str, **facts: Any) -> str:
-    """The Markdown of a template, in which lines with nothing but tags leave none."""
+    """The Markdown of a template, not escaped; lines with nothing but template tags leave no empty lines. Raises an
+    error of Jinja for a name that is missing.
+    """
     lines = _environment().overlay(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     return lines.get_template(name).render(**facts)
 
 
 @cache
 def _environment() -> Environment:
-    """Templates with their filters; a name that a template misses is an error."""
+    """The Jinja environment with the package's templates, filters and functions, made once per process. A name that is
+    missing in a template is an error; only HTML is escaped.
+    """
     environment = Environment(
         loader=PackageLoader("hilbo.report"), autoescape=select_autoescape(), undefined=StrictUndefined
     )
@@ -103,43 +116,51 @@ def _environment() -> Environment:
 
 
 def heads(study: Study, names: Iterable[str]) -> list[str]:
-    """Parameters with their units, as heads of columns."""
+    """Column heads of parameters, such as "K1 (N/mm)"; without a unit the name alone. `names`: of the study's
+    parameters, or K0. Raises `KeyError` for others.
+    """
     units = {"K0": "N/mm"} | {p.name: p.unit for p in study.space.parameters}
     return [f"{_symbol(name)} ({_unit(units[name])})" if units[name] else _symbol(name) for name in names]
 
 
 def _symbol(name: str) -> str:
+    """A parameter's name as printed: "α" for "alpha", others unchanged."""
     return "α" if name == "alpha" else name
 
 
 def _unit(unit: str) -> str:
+    """A unit of a study file as printed, such as "N·sᵅ/mm" for "N.s^alpha/mm"."""
     return unit.replace("^alpha", "^α").replace("s^α", "sᵅ").replace(".", "·")
 
 
 def number(value: float | str) -> str:
-    """Four significant digits, never with an exponent; the name of a level as it is."""
+    """A number as text with four significant digits, never with an exponent; a text (name of a level) unchanged."""
     if isinstance(value, str):
         return value
     return np.format_float_positional(value, precision=4, unique=False, fractional=False, trim="-")
 
 
 def _extent(values: list[float | str]) -> str:
-    """From which end to which a parameter's values go, or which levels are among them."""
+    """Range of a parameter's values as text: "from 1 to 2" for the two ends `values`, "= 1" if they are equal, and "= a
+    or b" for names of levels.
+    """
     if isinstance(values[0], str) or values[0] == values[1]:
         return "= " + " or ".join(map(number, dict.fromkeys(values)))
     return f"from {number(values[0])} to {number(values[1])}"
 
 
 def percent(share: float, digits: int = 0) -> str:
-    """A share in per cent."""
+    """A fraction as text in per cent, such as "12 %", with so many decimals."""
     return f"{100 * share:.{digits}f} %"
 
 
 def _each(values: Any, form: str | None = None) -> str:
-    """Numbers of an array in a row, each by its form, or with four significant digits."""
+    """The numbers of an array as text, separated by commas; each by the %-format `form`, or with four significant
+    digits.
+    """
     return ", ".join(number(v) if form is None else form % v for v in np.ravel(values))
 
 
 def _listed(names: Iterable[str | None]) -> str:
-    """Names in quotation marks, in a row."""
+    """Names in double quotation marks, separated by commas."""
     return ", ".join(f'"{name}"' for name in names)

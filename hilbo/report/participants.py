@@ -1,4 +1,4 @@
-"""What result.json says of each participant, however many participants there are.
+"""What result.json has of each participant, for any number of participants.
 
 Parameter sets and passivity margins of all participants are computed together; their entries are made one at a time
 while the file is written, since a hundred thousand of them as Python objects would take more memory than the fits.
@@ -21,7 +21,13 @@ _TOGETHER = 4096  # sets whose mechanics are computed at once
 
 
 class People(NamedTuple):
-    """A row for each participant; iterating gives the entries of result.json."""
+    """The participants of result.json as columns; `entries` makes their entries one at a time.
+
+    `names` (M), `trials` (M,) numbers of responses, `certificate`: diagnostics (M,) by name, `labels`: of the
+    responses; `optima`: fields of the individual optima, `sets`: their parameters in physical units by name (M,),
+    `margins`: their passivity margins (M,), N·s/m. The last three are None if individual optima were not computed,
+    `margins` also without mechanics.
+    """
 
     names: Sequence[str]
     trials: np.ndarray
@@ -32,7 +38,9 @@ class People(NamedTuple):
     margins: np.ndarray | None
 
     def entries(self) -> Iterator[dict[str, Any]]:
-        """Participant, trials, optimum (null if none was sought) and certificate of each."""
+        """Entries of the participants for result.json, made one after the other: name, number of trials, optimum and
+        certificate. The optimum is None if individual optima were not computed.
+        """
         for j, name in enumerate(self.names):
             yield {
                 "participant": name,
@@ -42,6 +50,7 @@ class People(NamedTuple):
             }
 
     def _optimum(self, j):
+        """Optimum of participant j (row) for result.json; None if individual optima were not computed."""
         if self.optima is None or self.sets is None:
             return None
         chances = self.optima["class_probabilities"][j].tolist()
@@ -55,14 +64,18 @@ class People(NamedTuple):
         }
 
     def table(self) -> pd.DataFrame:
-        """The rows of optima.csv: everybody's own optimum, none if none was sought."""
+        """The rows of optima.csv for individual optima: `source` "individual:NAME" and the parameters; an empty table
+        if they were not computed.
+        """
         if self.sets is None:
             return pd.DataFrame()
         return pd.DataFrame({"source": [f"individual:{name}" for name in self.names]} | self.sets)
 
 
 def people_of(study: Study, aggregate: Any) -> People:
-    """The participants of an `Aggregate`."""
+    """The participants of an `Aggregate`, with parameter sets and margins of their individual optima where it has
+    these.
+    """
     individuals = aggregate.own
     sets, margins = (None, None) if individuals is None else parameter_sets(study, np.asarray(individuals.x))
     cohort = aggregate.cohort
@@ -75,8 +88,10 @@ def people_of(study: Study, aggregate: Any) -> People:
 
 
 def parameter_sets(study: Study, x: Float[np.ndarray, "M d"]) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-    """Points of the unit cube as parameter sets in physical units, derived K0 first, and their passivity margins
-    (N.s/m), None without mechanics."""
+    """Points (M, d) of the unit cube as parameter sets in physical units, and their passivity margins (M,), N·s/m.
+
+    The sets are columns (M,) by name, derived K0 first, levels by their names. The margins are None without mechanics.
+    """
     if len(x) > _TOGETHER:
         padded = np.concatenate([x, np.repeat(x[-1:], -len(x) % _TOGETHER, axis=0)])  # one compilation
         parts = [parameter_sets(study, block) for block in padded.reshape(-1, _TOGETHER, x.shape[1])]
@@ -93,5 +108,8 @@ def parameter_sets(study: Study, x: Float[np.ndarray, "M d"]) -> tuple[dict[str,
 
 @program
 def _mechanics(space, x):
+    """Physical values (M, d) of points (M, d) of the unit cube, derived parameters by name, and margins (M,) or
+    None.
+    """
     physical = space.to_physical(x)
     return physical, *derived_of(space, physical)

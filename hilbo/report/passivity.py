@@ -1,4 +1,4 @@
-"""What `hilbo passivity` says of one parameter set on a device: numbers, and a verdict in words."""
+"""Results of `hilbo passivity` for one parameter set on a device: numbers, and a verdict in words."""
 
 import math
 from typing import Any
@@ -10,11 +10,14 @@ __all__ = ["passivity_result", "passivity_words"]
 
 
 def passivity_result(model: FOSLS, b: float, delay: float = 0.0) -> dict[str, Any]:
-    """Status and margin by certificate, binding frequency, largest K1, a witness.
+    """The content of result.json of `hilbo passivity`: status, margin, binding frequency, largest K1, a witness.
 
-    For every delay of the force up to `delay` (s), as a device checks its sets and a study its space: the needed
-    damping first falls with the delay and then rises, so that it is largest either without delay or at `delay`:
-    `binding_delay`.
+    `b`: damping of the device, N·s/m. The status holds for every delay of the force up to `delay` (s), as a device
+    checks its sets and a study its space: the needed damping first falls with the delay and then rises, so that it is
+    largest either without delay or at `delay`; `binding_delay` is that one. `margin`: lower and upper bound, N·s/m;
+    `binding_frequency` in Hz; `largest_K1` in N/mm, None where every K1 is passive (`every_K1`) and for even N;
+    `witness`: frequency (Hz) and energy (mJ) of a cycle, missing where none was constructed. Raises `InputError` for a
+    delay out of range.
     """
     delays = (0.0, delay) if delay else (0.0,)
     certificate, binding = min(
@@ -45,7 +48,10 @@ def passivity_result(model: FOSLS, b: float, delay: float = 0.0) -> dict[str, An
 
 
 def passivity_words(content: dict[str, Any]) -> str:
-    """The verdict in one or two sentences."""
+    """The verdict in one to three sentences, from the content of `passivity_result`.
+
+    A negative static stiffness gives one sentence.
+    """
     K_eff, b = content["K_eff"], content["damping"]
     if K_eff < 0:
         return f"violated: the static stiffness H(1) = {K_eff:.4g} N/mm is negative, which no damping makes good."

@@ -1,4 +1,6 @@
-"""Results of `hilbo power`: every error as CSV, a summary, a figure, and a page that says what is enough."""
+"""Results of `hilbo power`: all errors as CSV, a summary, a figure, and a page that states which designs are
+sufficient.
+"""
 
 from pathlib import Path
 
@@ -17,9 +19,12 @@ _CHANCE = 0.8  # share of studies that must be within the error to call a design
 
 
 def enough(summary: pd.DataFrame, chance: float = _CHANCE) -> pd.DataFrame:
-    """For every number of participants the fewest trials from which on at least `chance` of all studies are within the
-    error, with all larger numbers simulated too, as far as the simulated ones prove it (`reached_surely`); NaN if the
-    largest does not."""
+    """Smallest sufficient number of trials for each number of participants: columns `participants` and `trials`.
+
+    A number of trials suffices if `reached_surely`, the lower confidence bound of the share of studies within the
+    target error, is at least `chance` for it and for all larger numbers simulated. NaN if the largest number does not
+    suffice. `summary`: of `simulation.power.summarise`.
+    """
     longest_first = summary.sort_values("trials", ascending=False)
     holds = (longest_first["reached_surely"] >= chance).groupby(longest_first["participants"]).cummin()
     good = longest_first[holds].groupby("participants")["trials"].min()
@@ -27,9 +32,11 @@ def enough(summary: pd.DataFrame, chance: float = _CHANCE) -> pd.DataFrame:
 
 
 def write_power(study: Study, errors: pd.DataFrame, plan: Plan, error: float, cost: Content, folder: Path) -> Content:
-    """Write the folder of `hilbo power`; returns the content of result.json.
+    """Write errors.csv, power.csv, result.json, the figure and report.html into an existing folder; return the content
+    of result.json.
 
-    `cost` has `seconds`, `jobs` and `preset`: how long it took on how many cores, and who was simulated.
+    `errors`: of every simulated study; `error`: target error of the optimum (NRMSE); `cost`: further keys of
+    result.json, namely `seconds` and `jobs` (run time and number of processes) and `preset` (the simulated population).
     """
     from hilbo.report.figures import power
 

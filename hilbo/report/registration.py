@@ -1,7 +1,7 @@
-"""A planned study as one page for a pre-registration: what was fixed before the first answer, from plan and study file.
+"""Page for the pre-registration of a planned study, in Markdown, from plan and study file.
 
-The page is Markdown, which registries take as it is. What no file says (why so many people, what is expected) stands
-there as a line to fill in, so that nobody takes its silence for a decision.
+What no file states, such as the reason for the number of participants and the expectations, is left as a line to fill
+in.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ _ACQUISITIONS = {
 
 
 def registration(study: StudyFile, plan: Plan, version: str) -> str:
-    """The page, in Markdown. `plan`: of this study, as `make_plan` gives it; `version`: hilbo's."""
+    """The page, in Markdown. `plan`: of this study, as `make_plan` gives it; `version`: hilbo's. Nothing is written."""
     return text_of(
         "registration.md",
         study=study,
@@ -39,7 +39,7 @@ def registration(study: StudyFile, plan: Plan, version: str) -> str:
 
 
 def selection_words(selection: Any) -> str:
-    """How the trials of a session are chosen, by the study file's table [selection]."""
+    """How the trials of a session are chosen, as half a sentence. `selection`: table [selection] of a study file."""
     words = _ACQUISITIONS.get(selection.acquisition, selection.acquisition)
     weight = f", weight {selection.weight:g}" if selection.acquisition == "ucb" else ""
     return (
@@ -49,6 +49,9 @@ def selection_words(selection: Any) -> str:
 
 
 def _model(study: StudyFile) -> str:
+    """Inference and the given hyperparameters of the [gp] table as text; "the rest learnt" if any of the four is not
+    given. Correlations of categorical parameters are listed too.
+    """
     gp = study.gp
     given = {
         "theta": gp.theta,
@@ -64,4 +67,5 @@ def _model(study: StudyFile) -> str:
 
 
 def _value(value: float | Sequence[float]) -> str:
+    """A number as text, or several as "(1, 2)"."""
     return f"{value:g}" if isinstance(value, int | float) else "(" + ", ".join(f"{v:g}" for v in value) + ")"

@@ -1,7 +1,7 @@
-"""Results -> result.json, a population map in netCDF, figures, and one HTML page that explains itself.
+"""Results of an aggregation: result.json, a population map in netCDF, figures, and one self-contained HTML page.
 
-`write_results` makes a whole results folder from an analysis: result.json (DESIGN: "Results"), optima.csv, map.nc,
-the figures as PNG, SVG and PDF, and report.html with the figures inside.
+`write_results` makes a whole results folder from an analysis: result.json (DESIGN: "Results"), optima.csv, map.nc, the
+figures as PNG, SVG and PDF, and report.html with the figures inside.
 """
 
 import base64
@@ -60,7 +60,11 @@ _PIXELS = 130  # of the page for an inch of a figure, so that all have letters o
 def misses(
     study: Study, x: Float[Array, "... d"] | Float[np.ndarray, "... d"], truth: Float[np.ndarray, " d"]
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """NRMSE of points to the truth by search range: over the searched parameters, and with the derived K0."""
+    """NRMSE of points (..., d) to the true optimum (d,), all in the unit cube: (...,) over the searched parameters, and
+    (...,) with the derived K0 as a further parameter.
+
+    The second is None without mechanics. An error of K0 is a fraction of `K0_range`.
+    """
     x = np.asarray(x)
     errors = np.asarray(nrmse(x, truth, study.gp.kernel.levels))
     if study.space.mechanics is None:
@@ -72,7 +76,9 @@ def misses(
 
 
 def versions() -> dict[str, str]:
-    """What made a result."""
+    """Versions of hilbo, Python and the numerical packages, JAX's first device, and the default float type, as
+    texts.
+    """
     packages = ("hilbo", "jax", "jaxlib", "numpy", "equinox", "optimistix")
     installed = {name: importlib.metadata.version(name) for name in packages}
     return installed | {
@@ -93,7 +99,13 @@ def result(
     region: Region | None = None,
     check: Content | None = None,
 ) -> Content:
-    """The content of result.json. `left_out`: sentences on who is not in it; `region`, `check`: of `CohortResults`."""
+    """The content of result.json of an aggregation; nothing is written.
+
+    **Arguments:** `truth`: true optimum (d,) in the unit cube, if known; `people`: of `people_of`, else computed here;
+    `left_out`: sentences on excluded participants, which become the first warnings; `region`, `check`: of
+    `CohortResults`. With more than `MANY` participants, "participants" is the record `people` itself, which
+    `write_result` writes piece by piece.
+    """
     people = people_of(study, aggregate) if people is None else people
     best = aggregate.optimum
     content = {
@@ -127,28 +139,39 @@ def result(
 
 
 def _random_effect(study: Study, aggregate: Aggregate) -> Content | None:
-    """Of the study's own map, or of the one among the alternatives that has it."""
+    """Content on the random effect, of the study's own map or else of the first alternative map that has one; None if
+    there is none.
+    """
     maps = (aggregate.map, *aggregate.maps.values())
     map_ = next((each for each in maps if each.effects is not None), None)
     return None if map_ is None else effect_content(study, aggregate.cohort, map_)
 
 
 def _mean_of_optima(study: Study, mean: Float[Array, " d"]) -> Content:
-    """The mean of everybody's own optimum, which nobody was asked about."""
+    """Parameters and passivity margin of the mean (d,) of the individual optima, a point that no participant was tested
+    at.
+    """
     rendering = Rendering.at(study.space, mean)
     return {"parameters": rendering.shown, "passivity_margin": rendering.margin}
 
 
 def _location(study: Study, aggregate: Aggregate, name: str, optimum: Optimum) -> list[str]:
-    """What is to be known of where an optimum lies, by the map of its own that `name` says."""
+    """Notes on an optimum's location (range limit, constraint, extrapolation); empty if there are none.
+
+    `name`: the aggregation method whose map gave the optimum; without a map of that name extrapolation is not checked.
+    """
     map_ = aggregate.maps.get(name)
     asked = None if map_ is None else asked_variance(map_, aggregate.cohort)
     return location_notes(study, optimum.x, optimum.sd, asked)
 
 
 def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> Content:
-    """How far one optimum is from another: NRMSE, and each parameter's way in its unit and in % of its range; from one
-    level to another it is 100 %, and the way in words."""
+    """Distance from the optimum `start` to the optimum `x`, both (d,) in the unit cube: `nrmse`, and `moved`, by
+    parameter.
+
+    Each parameter, derived K0 too, has the difference `by` in its unit, and `percent` of its range. Of levels, `by` is
+    a text and a change is 100 %.
+    """
     target, origin = (Rendering.at(study.space, point).shown for point in (x, start))
     levels = study.gp.kernel.levels
     percent = 100 * differences(levels, np.asarray(x), np.asarray(start))
@@ -160,14 +183,16 @@ def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> Con
 
 
 def _way(start: float | str, end: float | str) -> float | str:
-    """From one value to another: the difference, or of levels which they are."""
+    """Difference `end` - `start` of two values; of two levels the text "A to B", or "the same"."""
     if isinstance(start, str) or isinstance(end, str):
         return "the same" if start == end else f"{start} to {end}"
     return end - start
 
 
 def _not_converged(people: People) -> list[str]:
-    """A warning that names those whose fit is not certified, if there are any."""
+    """A list with one warning that names the participants whose fit did not converge, at most 10 by name; an empty list
+    if all converged.
+    """
     names = [name for name, good in zip(people.names, people.certificate["converged"], strict=True) if not good]
     if not names:
         return []
@@ -180,7 +205,9 @@ def _not_converged(people: People) -> list[str]:
 
 
 def optimum_content(study: Study, optimum: Optimum) -> Content:
-    """An optimum as result.json holds it."""
+    """An optimum as an entry of result.json: parameters in physical units, `unit` (its point in the unit cube), mean
+    and sd of the latent score, class probabilities by response, and passivity margin (N·s/m, None without mechanics).
+    """
     labels, rendering = study.responses, Rendering.at(study.space, optimum.x)
     return {
         "parameters": rendering.shown,
@@ -193,7 +220,12 @@ def optimum_content(study: Study, optimum: Optimum) -> Content:
 
 
 def _truth(study, aggregate, truth):
-    """Misses of everything that claims to be the optimum, where the truth is known."""
+    """Entry `truth` of result.json: NRMSE to the known optimum `truth` (d,) in the unit cube, of the map's optimum, the
+    alternatives and the mean of the individual optima; quartiles over the individual optima, each with and without K0.
+
+    Also mean and sd of the number of highest responses per participant; the sd is None for one participant. Raises
+    `InputError` if individual optima were not computed.
+    """
     individual_misses, individual_misses_with_K0 = misses(study, aggregate.individuals.x, truth)
     quartiles = np.percentile(individual_misses, [25, 50, 75]).tolist()
     claims = {"aggregate": aggregate.optimum.x, "mean_of_optima": aggregate.mean_of_optima}
@@ -230,11 +262,11 @@ def write_results(
     pictures: Pictures | None = None,
     grid: xr.Dataset | None = None,
 ) -> Content:
-    """Write the results folder; returns the content of result.json.
+    """Write the whole results folder, which must exist; return the content of result.json.
 
-    **Arguments:** `say` is told what is being done; `left_out`: sentences on who is not in it; `selection`,
-    `comparison`: as `page.results_page`, whose further `pictures` are those of the comparison; `grid`: of
-    `population_grid`, if it was made.
+    **Arguments:** `truth`: true optimum (d,) in the unit cube, if known; `say`: called with a text at each step;
+    `left_out`: sentences on excluded participants; `selection`, `comparison`: as for `page.results_page`, `pictures`:
+    figures of the comparison that are already written; `grid`: of `population_grid`, else computed here.
     """
     study, aggregate = population.study, population.aggregate
     people = people_of(study, aggregate)
@@ -252,7 +284,9 @@ def write_results(
 
 
 def population_grid(population: CohortResults) -> xr.Dataset:
-    """The population map on a grid; a coarse one where everybody is asked at each of its points."""
+    """Mean and variance of the population map on a grid. The grid is coarse (`coarse_cells`) for a population without
+    progress over trials, that is, one with many participants.
+    """
     cells = CELLS if population.following is not None else coarse_cells(population.study)
     return map_dataset(population.study, population.aggregate.surface, cells)
 
@@ -260,26 +294,31 @@ def population_grid(population: CohortResults) -> xr.Dataset:
 def cohort_content(
     population: CohortResults, truth: Float[np.ndarray, " d"] | None, people: People, left_out: Sequence[str] = ()
 ) -> Content:
-    """What result.json holds of a cohort; arguments as `result`."""
+    """The content of result.json of an analysed cohort; arguments as for `result`. Nothing is written."""
     study, aggregate, seed = population.study, population.aggregate, population.seed
     return result(study, aggregate, seed, truth, people, left_out, region=population.region, check=population.check)
 
 
 def write_numbers(content: Content, people: People, grid: xr.Dataset, folder: Path) -> None:
-    """Write result.json with its digest, optima.csv, and the map as `write_grid`."""
+    """Write result.json (with its digest), optima.csv and map.nc into an existing folder; adds attributes to `grid`."""
     write_result(content, folder, sealed=True)
     optima_table(content, people).to_csv(folder / "optima.csv", index=False)
     write_grid(content, grid, folder)
 
 
 def write_grid(content: Content, grid: xr.Dataset, folder: Path) -> None:
-    """Write map.nc, with the rule and the optimum of result.json as attributes."""
+    """Write map.nc into an existing folder; the aggregation method and the optimum's parameters (as JSON) become
+    attributes of `grid` itself.
+    """
     grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
     write_map(grid, folder / "map.nc")
 
 
 def save_figures(figures: Mapping[str, Any], folder: Path) -> Pictures:
-    """Write figures by name as PNG, SVG and PDF; returns what a page needs to hold them."""
+    """Write matplotlib figures by name as PNG, SVG and PDF into an existing folder.
+
+    Returns for each its PNG in base64 and its width on a page in pixels, for `page`.
+    """
     widths = {name: str(round(_PIXELS * figure.get_figwidth())) for name, figure in figures.items()}
     return {
         name: {"png": base64.b64encode(png).decode(), "width": widths[name]}
@@ -288,7 +327,10 @@ def save_figures(figures: Mapping[str, Any], folder: Path) -> Pictures:
 
 
 def optima_table(content: Content, people: People) -> pd.DataFrame:
-    """What optima.csv holds: the population's, the alternatives' and everybody's own."""
+    """The rows of optima.csv: the map's optimum (`source` "aggregate"), the alternatives', and the individual ones.
+
+    The location notes of the first two are joined by semicolons; individual optima have none.
+    """
     claims = {"aggregate": content["optimum"]} | content["alternatives"]
     rows = [
         {"source": name} | claim["parameters"] | {"location": "; ".join(claim["location"])}
@@ -300,7 +342,10 @@ def optima_table(content: Content, people: People) -> pd.DataFrame:
 def _figures(
     population: CohortResults, truth: Float[np.ndarray, " d"] | None, grid: xr.Dataset
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Figures by their names, and what else `results_page` is told of them."""
+    """Matplotlib figures of an aggregation by name, and further arguments of `results_page`: `drawn` for a large
+    population, else `halves`. For others than large ones it waits for the progress over trials to be computed. `truth`
+    (d,) is marked if known.
+    """
     from hilbo.report.figures import maps
     from hilbo.report.figures.effects import effects_figure
     from hilbo.report.figures.progress import progress_figure

@@ -1,4 +1,4 @@
-"""Results of the robustness check: result.json, both population maps, figures, and a page that explains itself."""
+"""Results of the robustness check: result.json, both population maps, figures, and a self-contained page."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,8 +27,11 @@ _UNRELATED = 0.1
 def write_robustness(
     study: Study, cohort: Cohort, check: Robustness, folder: Path, seed: int = 0, left_out: Sequence[str] = ()
 ) -> Content:
-    """Write the folder of `hilbo robustness`; returns the content of result.json. `left_out`: sentences on who is not
-    in it."""
+    """Write result.json, map.nc (both maps), the figures and report.html into an existing folder; return the content of
+    result.json.
+
+    `left_out`: sentences on excluded participants, which become the first warnings; `seed`: only recorded.
+    """
     content = robustness_result(study, cohort, check, seed)
     content["warnings"] = [*left_out, *content["warnings"]]
     write_result(content, folder)
@@ -41,7 +44,9 @@ def write_robustness(
 
 
 def robustness_page(study: Study, content: Content, figures: Pictures) -> str:
-    """One self-contained page of the robustness check."""
+    """The page of the robustness check as HTML, with its figures inside. `content`: of `robustness_result`; `figures`:
+    of `save_figures`.
+    """
     # Of each hyperparameter a list of columns: how each parameter moves with it, in search ranges.
     sensitivity = {name: np.atleast_2d(np.asarray(block).T) for name, block in content["sensitivity"].items()}
     return rendered(
@@ -58,17 +63,18 @@ def robustness_page(study: Study, content: Content, figures: Pictures) -> str:
 
 
 def _table(learned: Content) -> str:
-    """[gp] of a study file with what was learnt, to be copied into one."""
+    """The learnt hyperparameters as a [gp] table of a study file, TOML text with four significant digits."""
     names = ("theta", "variance", "thresholds", "noise")
     return "\n".join(["[gp]", *(f"{name} = {_four_digits(learned[name])}" for name in names)])
 
 
 def _four_digits(value: float | list[float]) -> str:
+    """A number, or a list of numbers, as TOML text with four significant digits."""
     return f"[{', '.join(map(_four_digits, value))}]" if isinstance(value, list) else repr(float(f"{value:.4g}"))
 
 
 def _figures(study, cohort, check):
-    """Name -> figure."""
+    """Matplotlib figures: "maps", under fixed and under learnt hyperparameters, and "moves", shifts of the optima."""
     from hilbo.report.figures import maps
 
     fixed, optimised = check.maps()
@@ -80,7 +86,11 @@ def _figures(study, cohort, check):
 
 
 def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int) -> Content:
-    """The content of result.json of `hilbo robustness`: both optima, their distance, what was learnt, derivatives."""
+    """The content of result.json of `hilbo robustness`, without excluded participants' sentences.
+
+    Both optima, their distance (NRMSE), that of each participant, the learnt hyperparameters, and the optimum's
+    derivatives by them. `seed`: only recorded.
+    """
     maximum, people = check.maximum, len(cohort.names)
     stacked = [np.broadcast_to(np.asarray(flags), (people,)) for flags in (maximum.converged, maximum.runaway)]
     rows = [
@@ -121,11 +131,16 @@ def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int
 
 
 def _percentiles(draws):
+    """Median and 95th percentile of numbers, under the keys "median" and "95 %"."""
     return dict(zip(("median", "95 %"), np.percentile(draws, [50, 95]).tolist(), strict=True))
 
 
 def _warnings(check, stacked):
-    """What the learnt hyperparameters themselves say against the comparison, in sentences."""
+    """Warnings about the learnt hyperparameters, as sentences: a correlation length below a tenth of a search range,
+    searches that did not converge or ran away, and an inaccurate Laplace evidence.
+
+    `stacked`: flags (M,) of converged and of runaway searches, of each participant.
+    """
     converged, runaway = stacked
     kernel = check.maximum.gp.kernel
     of_numbers = np.array(kernel.levels) == 0 if kernel.levels else ...

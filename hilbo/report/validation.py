@@ -45,7 +45,12 @@ __all__ = [
 
 
 class Validated(NamedTuple):
-    """Everything that the validation sessions of one material say."""
+    """Statistics of the validation sessions of one material ("" if the table names none).
+
+    `overall`: share of comparisons in which the aggregate's set is preferred to an individual's, ties excluded, with
+    every kind of interval; `people`: the same by participant. Both are None without such comparisons, `overall` also if
+    all are ties.
+    """
 
     material: str
     tables: PaperTables
@@ -57,13 +62,15 @@ class Validated(NamedTuple):
     comparisons: int
 
     def regressions(self) -> dict[str, Regression]:
-        """Tables II to IV by their number, those that there are."""
+        """The regressions of tables "II", "III" and "IV" by number; those that the data do not allow are missing."""
         by_number = {"II": self.tables.table_2, "III": self.tables.table_3, "IV": self.tables.table_4}
         return {number: table for number, table in by_number.items() if table is not None}
 
 
 def materials_of(table: pd.DataFrame) -> list[str | None]:
-    """The materials of a validation or trial table, in order of appearance; [None] if it names none."""
+    """The distinct materials of a validation or trial table, in order of appearance; [None] without a column
+    `material`.
+    """
     return list(pd.unique(table["material"])) if "material" in table else [None]
 
 
@@ -73,7 +80,11 @@ def validate(
     responses: Sequence[str] = RESPONSES,
     material: str | None = None,
 ) -> Validated:
-    """The statistics of one material's comparisons. Raises `InputError` for a bad table."""
+    """Statistics of the comparisons of one material; `material` may be None if the table has only one.
+
+    `sets`: the sets table, indexed by `set_id`, or None; `responses`: labels, lowest first. Raises `InputError` for an
+    invalid table.
+    """
     chosen = of_material(check_validation(table, responses), material)
     tables = paper_tables(chosen, sets, responses=responses)
     rows = aggregate_comparisons(chosen, *set_sources(chosen, sets))
@@ -86,6 +97,11 @@ def validate(
 
 
 def _person(name, rows):
+    """One participant's row: name, wins of the aggregate's set, losses, ties, and win rate with its exact 95 %
+    interval.
+
+    `rows`: the participant's comparisons. With ties alone the rate is NaN and the interval 0 to 1.
+    """
     wins, losses = (int((rows["preferred"] == word).sum()) for word in ("Aggregate-Best", "individual"))
     row = {"name": name, "wins": wins, "losses": losses, "ties": len(rows) - wins - losses}
     if not wins + losses:
@@ -95,7 +111,9 @@ def _person(name, rows):
 
 
 def safest(table: Regression) -> pd.DataFrame:
-    """Of every coefficient the row with the widest interval among iid and clustered errors; or its profile."""
+    """For each coefficient the row with the widest interval, among iid and clustered errors with a finite standard
+    error; the row with profile likelihood errors, if there is one.
+    """
     rows = []
     for _, mine in table.table.groupby("term", sort=False):
         width = (mine["high"] - mine["low"]).where(np.isfinite(mine["std_error"]), -1.0)
@@ -105,7 +123,7 @@ def safest(table: Regression) -> pd.DataFrame:
 
 
 def validation_content(validated: Validated) -> Content:
-    """As result.json holds it."""
+    """Statistics of one material as an entry of result.json; `aggregate_best` is missing without such comparisons."""
     tables = validated.tables
     content: Content = {
         "material": validated.material,
@@ -126,15 +144,19 @@ def validation_content(validated: Validated) -> Content:
 
 
 def _records(table):
+    """Rows of a table as dictionaries with Python numbers."""
     return [{str(k): _plain(v) for k, v in row.items()} for row in table.to_dict("records")]
 
 
 def _plain(value):
+    """A NumPy scalar as a Python number; other values unchanged."""
     return value.item() if isinstance(value, np.generic) else value
 
 
 def validation_csv(validated: Validated) -> dict[str, pd.DataFrame]:
-    """File name (without .csv) -> table."""
+    """Tables of one material by file name without .csv: confusion, preferences, table_II to table_IV and
+    aggregate_best, as far as there are such.
+    """
     tables = validated.tables
     files = {"confusion": _with_sets(tables.confusion), "preferences": tables.preferences}
     files |= {f"table_{number}": table.table for number, table in validated.regressions().items()}
@@ -144,14 +166,16 @@ def validation_csv(validated: Validated) -> dict[str, pd.DataFrame]:
 
 
 def _with_sets(confusion: pd.DataFrame) -> pd.DataFrame:
-    """The counts with a first column `set`, called set_1 (and so on) where an answer is called as it."""
+    """The confusion matrix with its index as the first column, `set`; if a response has that name, set_1, set_2 and so
+    on.
+    """
     names = itertools.chain(["set"], (f"set_{n}" for n in itertools.count(1)))
     free = next(name for name in names if name not in confusion.columns)
     return confusion.rename_axis(index=free, columns=None).reset_index()
 
 
 def validation_figures(validated: Validated) -> dict[str, Any]:
-    """Name -> figure, those that there are."""
+    """Matplotlib figures of one material by name, those that its data allow: "validation" and "aggregate-best"."""
     from hilbo.report.figures import validation as plotting
 
     figures = {}
@@ -163,7 +187,9 @@ def validation_figures(validated: Validated) -> dict[str, Any]:
 
 
 def validation_section(validated: Validated) -> Content:
-    """What the page says of one material. `tied`: the table is of the model with ties."""
+    """Section of the page for one material: counts, limits, and rows of each regression as text. `tied`: whether the
+    regression is of the model with ties.
+    """
     return {
         "material": validated.material,
         "participants": validated.participants,
@@ -177,6 +203,9 @@ def validation_section(validated: Validated) -> Content:
 
 
 def _shown(table):
+    """Rows of a regression for the page, as texts: term, estimate, standard error, statistic, degrees of freedom, p
+    value, interval, kind of error; "–" for values that are not known.
+    """
     rows = []
     for _, row in safest(table).iterrows():
         sure = np.isfinite(row["std_error"])
@@ -194,11 +223,12 @@ def _shown(table):
 
 
 def _end(value):
+    """An interval end as text with two decimals; "∞" or "−∞" if it is not finite."""
     return f"{value:.2f}" if np.isfinite(value) else ("∞" if value > 0 else "−∞")
 
 
 def p_words(p: float) -> str:
-    """A p-value as it is printed."""
+    """A p value as text with three decimals, "< 0.001" below that, and "–" if it is not finite."""
     return "–" if not np.isfinite(p) else "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
@@ -211,7 +241,12 @@ def write_validation(
     seed: int = 0,
     say=lambda text: None,
 ) -> Content:
-    """Write the folder of `hilbo validate`; returns the content of result.json."""
+    """Write the results of `hilbo validate` into an existing folder; return the content of result.json.
+
+    With several materials the tables and figures of each go to a folder of its own within it. `path`, `sets`: files of
+    the validation table and of the sets table, or None; `material`: the only one to analyse, None: all; `seed`: only
+    recorded; `say`: called with a text at each step. Raises `InputError` for invalid tables.
+    """
     say("reading")
     table = _read(path, study, material)
     sets_by_id = None if sets is None else sets_frame(sets, study.space.names, study.space.parameters)
@@ -238,7 +273,10 @@ def write_validation(
 
 
 def _read(path: Path, study: Study, material: str | None) -> pd.DataFrame:
-    """The comparisons of all materials, or of one."""
+    """Read and check the comparisons of one material, or of all if `material` is None; excluded flags are left out.
+
+    Raises `InputError` for a file that cannot be read or an invalid table.
+    """
     if material is not None:
         return read_validation(path, study.responses, material, study.file.exclude_flags)
     cells = read_cells(path, "a validation table needs a header and a comparison")
@@ -246,13 +284,18 @@ def _read(path: Path, study: Study, material: str | None) -> pd.DataFrame:
 
 
 def named_warnings(contents: Mapping[Any, Mapping[str, Any]]) -> list[str]:
-    """The warnings of the contents of result.json by material; each says of which it is, where there are several."""
+    """The warnings of the contents of result.json by material, in one list; with several materials each begins with the
+    name of its own.
+    """
     several = len(contents) > 1
     return [f"{name}: {text}" if several else text for name, one in contents.items() for text in one["warnings"]]
 
 
 def folder_names(names: Sequence[str | None]) -> dict[str | None, str]:
-    """A folder for each material; two names that differ in signs or capitals alone get a number."""
+    """Folder names for materials, all different: lower case, with signs as hyphens; equal ones get a number from 2 on.
+
+    The result's keys are the `names`.
+    """
     folders: dict[str | None, str] = {}
     for name in names:
         plain = _slug(str(name))
@@ -262,6 +305,8 @@ def folder_names(names: Sequence[str | None]) -> dict[str | None, str]:
 
 
 def _slug(name: str) -> str:
-    """A name as part of a file's name."""
+    """A name as part of a file name: lower case, letters and digits, separated by single hyphens; "material" if nothing
+    is left.
+    """
     kept = "".join(c if c.isalnum() else "-" for c in name.lower())
     return "-".join(word for word in kept.split("-") if word) or "material"
