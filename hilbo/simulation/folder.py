@@ -28,10 +28,11 @@ class Simulated(NamedTuple):
 
 
 def simulate_folder(folder: Path, preset: str | None, count: int, seed: int, source: Path | None = None) -> Simulated:
-    """Simulate `count` participants and write trials.csv, truth.csv and study.toml.
+    """Simulate `count` participants and write trials.csv, truth.csv and study.toml to an existing folder, over existing
+    files.
 
     `preset`: name of the population, as in `population_of`. `source`: a study file instead of the paper's. Raises
-    InputError for an unknown preset.
+    InputError for an invalid study file, an unknown preset, and a population that does not fit the study.
     """
     path = Path(str(files("hilbo") / "data" / "paper.toml")) if source is None else source
     study = Study.load(path)

@@ -117,7 +117,8 @@ def cores() -> int:
 
 @contextlib.contextmanager
 def _pool(jobs: int, initializer: Callable[[], None] | None) -> Iterator[ProcessPoolExecutor]:
-    """Pool of new processes with one core each, set by XLA's flags in their environment."""
+    """Context manager with a pool of `jobs` new processes of one core each, which call `initializer` first. Sets
+    XLA_FLAGS in this process's environment, which they inherit, and restores it at the end."""
     before = os.environ.get("XLA_FLAGS")
     os.environ["XLA_FLAGS"] = f"{before or ''} {_ONE_CORE}".strip()
     try:
@@ -131,13 +132,14 @@ def _pool(jobs: int, initializer: Callable[[], None] | None) -> Iterator[Process
 
 
 def _study_in_process(content: str, rule: str, population_: Population, plan: Plan, index: int) -> pd.DataFrame:
-    """Run one study from arguments that can be sent to another process."""
+    """`one_study` from arguments that can be sent to another process. `content`: the study file as JSON."""
     study = by_rule(Study.from_dict({"schema": 1} | json.loads(content)), rule)
     return one_study(study, population_, plan, index)
 
 
 def one_study(study: Study, population_: Population, plan: Plan, index: int) -> pd.DataFrame:
-    """The errors of simulated study number `index`."""
+    """Simulate study number `index` of the plan; returns its errors at every (m, t), in the columns of
+    `simulate_power`."""
     most, longest = max(plan.participants), max(plan.trials)
     seed = int(np.random.default_rng([plan.seed, index]).integers(2**31))
     staged = _with_trials(study, longest)
@@ -182,12 +184,12 @@ def _rms(difference: Float[np.ndarray, "..."]) -> float:
 
 @program
 def _map_top_probability(study: Study, map_: RuleMap, points: Float[Array, "m d"]) -> Float[Array, " m"]:
-    """Predicted probability of the highest response of a new participant, at each point."""
+    """Predicted probability of a new participant's highest response at each point. (m,)."""
     return map_.class_probabilities(study.gp.likelihood, points)[:, -1]
 
 
 def _with_trials(study: Study, trials: int) -> Study:
-    """Copy of the study with another number of trials."""
+    """Copy of the study with another number of trials; the space-filling ones are reduced to it if they are more."""
     content = json.loads(study.file.content)
     content.setdefault("selection", {})["trials"] = trials
     filling = min(study.file.selection.space_filling, trials)
@@ -232,5 +234,6 @@ def summarise(errors: pd.DataFrame, error: float) -> pd.DataFrame:
 
 
 def power_table(summary: pd.DataFrame, value: str) -> pd.DataFrame:
-    """One column of the summary as a table of participants by trials."""
+    """One column of the summary (`value`) as a table: a row per number of participants, a column per number of
+    trials."""
     return summary.pivot(index="participants", columns="trials", values=value)

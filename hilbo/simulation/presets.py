@@ -23,7 +23,7 @@ _STEP = 1.5  # from one criterion to the next, in tolerances, where a study stat
 
 
 def _read() -> dict[str, Population]:
-    """Read all populations."""
+    """Read hilbo/data/populations.toml: name -> population, with "paper" as a second name of one of them."""
     content = tomllib.loads((files("hilbo") / "data" / "populations.toml").read_text(encoding="utf-8"))
     populations = {name: _population(table) for name, table in content["populations"].items()}
     return {"paper": populations[content["paper"]]} | populations
@@ -74,7 +74,7 @@ def population_of(study: Study, preset: str | None = None) -> tuple[str, Populat
 
 
 def _of_these_ranges(study: Study, population: Population) -> bool:
-    """Whether the population's truth lies within the study's parameter ranges."""
+    """Whether the population's truth names exactly the study's parameters and lies within their ranges."""
     parameters, truth = study.space.parameters, population.truth
     return {p.name for p in parameters} == set(truth) and all(p.low <= truth[p.name] <= p.high for p in parameters)
 
@@ -95,7 +95,8 @@ def _stated(study: Study, table: SimulationTable) -> Population:
 
 
 def with_truth(study: Study, population: Population, seed: int) -> Population:
-    """Population with a truth; if it has none, one drawn uniformly from the feasible set."""
+    """The same population if it has a truth; otherwise a copy with one drawn by `seed` from 256 even points of the
+    feasible set."""
     if population.truth:
         return population
     points = np.asarray(study.space.to_physical(study.space.candidates(256, 0)))

@@ -61,7 +61,8 @@ class Person(eqx.Module):
 
 
 def felt_apart(levels: tuple[int, ...], x: Float[Any, "*#batch d"], y: Float[Any, "*#batch d"]) -> Float[Any, "... d"]:
-    """Perceived differences (..., d) of points, before division by the tolerances."""
+    """Perceived differences x - y (..., d) of points, before division by the tolerances; half a range between different
+    levels."""
     return differences(levels, x, y, _LEVELS_APART)
 
 
@@ -83,7 +84,8 @@ class Population(eqx.Module):
     lapse: float = eqx.field(static=True)
     drift_sd: float = eqx.field(static=True)
     contrast: float = eqx.field(static=True, default=0.0)
-    """In a validation: how much of the difference of two renderings, as they are felt side by side, is added to it."""
+    """In a validation: fraction of the perceived difference between two stimuli that is added when they are compared
+    side by side."""
 
 
 def people(study: Study, population: Population, count: int, seed: int) -> Person:
@@ -132,7 +134,8 @@ def _with_levels(
     spread: tuple[float, ...],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "n d"]:
-    """Drawn optima with the truth's levels, or for the proportion `spread` of participants another, random level."""
+    """Set the categorical coordinates of drawn optima, in place: the truth's level, or with probability `spread`
+    another, random one. Returns the same array."""
     for i, count in ((i, count) for i, count in enumerate(levels) if count):
         moved = np.where(rng.random(len(drawn)) < spread[i], rng.integers(1, count, len(drawn)), 0)
         drawn[:, i] = (np.rint(truth[i] * (count - 1)) + moved) % count / (count - 1)
@@ -140,7 +143,8 @@ def _with_levels(
 
 
 def simulate_study(study: Study, persons: Person, seed: int) -> Trials:
-    """Simulate all sessions: space-filling and acquisition trials, in one call. Returns stacked trials (M, ...).
+    """Simulate all sessions, space-filling and acquisition trials, in one compiled call. Returns stacked trials (M,
+    ...).
 
     Each participant has an individual Latin hypercube; the candidates of the acquisition are shared.
     """
@@ -210,7 +214,8 @@ def to_table(study: Study, trials: Trials) -> pd.DataFrame:
 
 
 def truth_table(study: Study, population: Population, persons: Person) -> pd.DataFrame:
-    """True optima of the population and of all participants, in physical units."""
+    """True optima in physical units: a column `source` ("population", then "individual:P01" and so on) and one per
+    parameter."""
     individual_sets = np.asarray(study.space.to_physical(persons.optimum))
     width = max(2, len(str(len(individual_sets))))
     centre = [population.truth[name] for name in study.space.names]

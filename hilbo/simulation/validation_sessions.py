@@ -26,7 +26,8 @@ _TWICE = 2  # that a judge compares an individual's set with the aggregate's
 
 
 def sets_table(study: Study, sets: Sets, individuals: Float[np.ndarray, "M d"]) -> pd.DataFrame:
-    """Sets table with best, mid and worst of the aggregate map and all individual sets under a code, as in a plan.
+    """Sets table with best, mid and worst of the aggregate map, and all individual sets under anonymous codes, as in a
+    plan.
 
     The aggregate's own set is "best". `individuals` (M, d) in the unit cube.
     """
@@ -47,7 +48,8 @@ def sets_table(study: Study, sets: Sets, individuals: Float[np.ndarray, "M d"]) 
 def validation_table(
     study: Study, population: Population, table: pd.DataFrame, *, participants: int = 20, judges: int = 8, seed: int = 0
 ) -> pd.DataFrame:
-    """Simulate a validation table over the sets of `sets_table`, in a random order for each participant."""
+    """Simulate a validation table over the sets of `sets_table`: new participants N01, … compare best, mid and worst,
+    and judges J01, … compare "best" with each individual set, each in a random order."""
     rng = np.random.default_rng([seed, 1])
     crowd = people(study, population, participants + judges, seed + 7_919)
     x = {row["set_id"]: _unit(study, row) for _, row in table.iterrows()}
@@ -83,7 +85,8 @@ def _answer(
     contrast: float,
     rng: np.random.Generator,
 ) -> tuple[list[str], int]:
-    """Simulate the classes of two stimuli, and the index of the preferred one."""
+    """Simulate a comparison of the stimuli x and y (d,) by one participant of `crowd`: labels of both classes, and the
+    preferred one (0: x, 1: y)."""
     optimum, tolerance = np.asarray(crowd.optimum[person]), np.asarray(crowd.tolerance[person])
     away = (felt_apart(crowd.levels, point, optimum) / tolerance for point in (x, y))
     felt = np.array([np.sqrt(np.sum(each**2)) for each in away])

@@ -74,7 +74,8 @@ def labels_of(given: Columns | None, n: int) -> dict[str, Int[np.ndarray, " n"]]
 
 
 def _columns(what: str, given: Columns | None) -> dict[str, Any]:
-    """Columns by name; a Series by its own name. Raises `InputError` for objects without names."""
+    """Columns by name; a Series by its own name, or `what` if it has none; no columns for None. Raises `InputError` for
+    objects without names."""
     if given is None:
         return {}
     if isinstance(given, pd.DataFrame | Mapping):

@@ -133,7 +133,8 @@ def _sets_compared(left: np.ndarray, right: np.ndarray, chosen: np.ndarray) -> l
 
 
 def _shown_first(order: Sequence | np.ndarray | None, count: int) -> np.ndarray:
-    """`order` as an array (count,), 0 if it is None. Raises `InputError` for other values than 1, -1 and 0."""
+    """`order` as an array (count,), all 0 if it is None. Raises `InputError` for other values than 1, -1 and 0, and a
+    wrong length."""
     shown_first = np.zeros(count) if order is None else np.asarray(order)
     if shown_first.shape != (count,) or pd.isna(shown_first).any() or not np.isin(shown_first, (-1, 0, 1)).all():
         raise InputError("order must hold 1, -1 or 0 for each comparison: first was shown first, second, or unknown.")

@@ -48,15 +48,15 @@ class Design(NamedTuple):
         return self.upper_offset + self.upper @ theta, self.lower_offset + self.lower @ theta
 
     def rows(self, keep: np.ndarray) -> "Design":
-        """Design of the selected responses (mask or indices)."""
+        """Design of the selected responses (mask or indices), all parameters kept."""
         return Design(self.upper[keep], self.lower[keep], self.upper_offset[keep], self.lower_offset[keep])
 
     def columns(self, keep: np.ndarray) -> "Design":
-        """Design of the selected parameters, the others being 0."""
+        """Design of the selected parameters (mask or indices), the others being 0."""
         return Design(self.upper[:, keep], self.lower[:, keep], self.upper_offset, self.lower_offset)
 
     def fixed(self, column: int, value: float) -> "Design":
-        """Design of the other parameters when one of them is fixed at `value`."""
+        """Design of the other parameters when the one with index `column` is fixed at `value`; one column fewer."""
         upper = self.upper_offset + self.upper[:, column] * value
         lower = self.lower_offset + self.lower[:, column] * value
         others = np.arange(self.upper.shape[1]) != column

@@ -79,9 +79,10 @@ def paper_tables(
 
 
 def set_sources(table: pd.DataFrame, sets: pd.DataFrame | None) -> tuple[dict[str, str], dict[str, str]]:
-    """Source and role of every set of a validation table; from the set names if there is no sets table.
+    """Source and role of every set of a validation table, as two dicts by set name, from the sets table.
 
-    Raises `InputError` for a set that is missing from the sets table.
+    Without one, the last word of the name is both the source and, if it is best, mid or worst, the role; otherwise the
+    role is the whole name. Raises `InputError` for a set that is missing from the sets table.
     """
     used = sorted({*table["set_a"], *table["set_b"]})
     if sets is None:
@@ -94,7 +95,8 @@ def set_sources(table: pd.DataFrame, sets: pd.DataFrame | None) -> tuple[dict[st
 
 
 def _table_2(answers: pd.DataFrame, responses: Sequence[str], level: float) -> Regression:
-    """Table II: logit of the highest response on whether the set was best."""
+    """Table II: logit of the highest response on whether the set was best. Raises InputError if no best set was
+    classified."""
     _need(answers, ("best",))
     close = (answers["class"] == responses[-1]).astype(int)
     best = {"Best": (answers["set"] == "best").astype(float)}
@@ -102,7 +104,8 @@ def _table_2(answers: pd.DataFrame, responses: Sequence[str], level: float) -> R
 
 
 def _table_3(answers: pd.DataFrame, responses: Sequence[str], level: float) -> Regression:
-    """Table III: ordered logit of the response class on best and worst."""
+    """Table III: ordered logit of the class on best and worst. Raises InputError if best, mid or worst was never
+    classified."""
     _need(answers, ROLES)
     shifts = {name.capitalize(): (answers["set"] == name).astype(float) for name in ("best", "worst")}
     ranks, names = len(responses) - 1 - answers["category"], list(responses)[::-1]
@@ -110,7 +113,8 @@ def _table_3(answers: pd.DataFrame, responses: Sequence[str], level: float) -> R
 
 
 def _table_4(table: pd.DataFrame, sources: Mapping[str, str], roles: Mapping[str, str], level: float) -> Regression:
-    """Table IV: logit of preferring the aggregate's set to an individual's; with ties by a model for ties."""
+    """Table IV: logit of preferring the aggregate's set to an individual's; with ties the model for ties. Raises
+    InputError without such comparisons."""
     rows = aggregate_comparisons(table, sources, roles)
     if rows.empty:
         raise InputError("no comparison of an aggregate's set with an individual's holds a preference.")
@@ -142,7 +146,7 @@ def aggregate_comparisons(
 
 
 def _need(answers: pd.DataFrame, roles: Sequence[str]) -> None:
-    """Raise `InputError` if a set of these roles was never classified."""
+    """Raise `InputError` unless sets of all these roles were classified."""
     absent = [name for name in roles if name not in set(answers["set"])]
     if absent:
         raise InputError(f'no comparison classifies the set "{absent[0]}".')

@@ -25,7 +25,8 @@ _INDEPENDENT = "all answers are independent"
 
 
 def classifications(table: pd.DataFrame, responses: Sequence[str] = RESPONSES) -> pd.DataFrame:
-    """One row per set shown and classified: `participant`, `set`, `class` and `category` (0 = lowest response)."""
+    """One row per set shown and classified: `participant`, `set`, `class` and `category` (0 = lowest response).
+    `table`: a checked validation table."""
     halves = [
         table[["participant", f"set_{side}", f"class_{side}"]].set_axis(["participant", "set", "class"], axis=1)
         for side in "ab"
@@ -36,7 +37,8 @@ def classifications(table: pd.DataFrame, responses: Sequence[str] = RESPONSES) -
 
 
 def confusion(table: pd.DataFrame, responses: Sequence[str] = RESPONSES, sets: Sequence[str] = ()) -> pd.DataFrame:
-    """Confusion matrix: number of times each set (row) was put in each class (column, highest first)."""
+    """Confusion matrix: number of times each set (row) was put in each class (column, highest first). `sets`: the rows,
+    by default all sets that were classified, sorted."""
     answers = classifications(table, responses)
     rows = list(sets) or sorted(answers["set"].unique())
     return pd.crosstab(answers["set"], answers["class"]).reindex(rows, columns=list(responses)[::-1], fill_value=0)
@@ -75,7 +77,8 @@ def preference_rates(table: pd.DataFrame, sets: Sequence[str] = (), *, level: fl
     """For each pair of sets the rate at which the first was preferred: one row per pair and kind of interval.
 
     `sets`: the ones to compare, in the order in which a pair names them; default: all, sorted. Columns `set`, `over`,
-    `comparisons`, `wins`, `losses`, `ties`, and those of `rate`. A pair with ties only has none.
+    `comparisons`, `wins`, `losses`, `ties`, and those of `rate`, which a pair with ties only does not have. An empty
+    table without preferences.
     """
     check_level(level)
     compared = table[table["preferred"] != NONE]
@@ -99,7 +102,8 @@ def preference_rates(table: pd.DataFrame, sets: Sequence[str] = (), *, level: fl
 def _unanimous(
     hits: np.ndarray, labels: Mapping[str, np.ndarray], level: float
 ) -> list[tuple[str, float, float, float, str]]:
-    """Intervals by cluster for unanimous responses: proportion of clusters that would agree, from those that did."""
+    """Rows of `rate`'s table for unanimous responses, one per clustering variable: exact interval of the proportion of
+    clusters that agree in every response."""
     rows = []
     for name, codes in labels.items():
         people = int(codes.max()) + 1

@@ -1,8 +1,11 @@
 """Fitted logit with every kind of standard error in one tidy table.
 
-| errors | what they assume | |---|---| | iid | every response independent of every other | | clustered by A | A's
-clusters independent, and many; t with G - 1 degrees of freedom | | clustered by A and B | responses that share neither
-independent; t with the smaller G - 1 | | profile likelihood | as iid; for a coefficient that has no finite estimate |
+| errors | what they assume |
+|---|---|
+| iid | every response independent of every other |
+| clustered by A | A's clusters independent, and many; t with G - 1 degrees of freedom |
+| clustered by A and B | responses that share neither independent; t with the smaller G - 1 |
+| profile likelihood | as iid; for a coefficient that has no finite estimate |
 
 `docs/methods/statistics.md` recommends which to use, from their coverage in simulated studies. statsmodels fits and
 clusters; the table, its warnings and the separated coefficients are added here.
@@ -51,7 +54,7 @@ class Regression(eqx.Module):
     warnings: tuple[str, ...]
 
     def by(self, errors: str) -> pd.DataFrame:
-        """Rows with one kind of error, indexed by term; including the coefficients that are not finite."""
+        """Rows with one kind of error, indexed by term; coefficients without a finite estimate are included."""
         kinds = [errors, "profile likelihood"]
         return self.table[self.table["errors"].isin(kinds)].set_index("term")
 
@@ -122,14 +125,14 @@ def regress(
 
 
 def _in_own_units(model: Design) -> tuple[Design, Float[np.ndarray, " k"]]:
-    """Design with columns scaled to a largest entry of about 1, and the power of two by which each was divided."""
+    """Design with columns scaled to a largest entry of about 1, and the power of two by which each was divided (k,)."""
     largest = np.abs(np.vstack([model.upper, model.lower])).max(axis=0)
     units = 2.0 ** np.round(np.log2(np.where(largest > 0, largest, 1.0)))
     return model._replace(upper=model.upper / units, lower=model.lower / units), units
 
 
 def _covariance(kind: Errors, terms: Mapping[int, str]) -> pd.DataFrame:
-    """Covariance of the named coefficients as a table."""
+    """Covariance of the coefficients `terms` (index -> name) as a table with their names."""
     shown = list(terms.values())
     return pd.DataFrame(kind.covariance.matrix[np.ix_(list(terms), list(terms))], shown, shown)
 
@@ -173,7 +176,8 @@ def _kinds(fitted: Fit, labels: Mapping[str, Int[np.ndarray, " n"]]) -> tuple[li
 
 
 def _below_iid(kinds: list[Errors], terms: Mapping[int, str]) -> list[str]:
-    """A warning for each kind of clustered error that is smaller than the iid error of some coefficient."""
+    """A warning for each kind of clustered error that is smaller than the iid error of some coefficient. `kinds`: iid
+    first; `terms`: index -> name of the coefficients to compare."""
     reference, sentences = kinds[0].std_errors, []
     for kind in kinds[1:]:
         errors = kind.std_errors
@@ -190,7 +194,8 @@ def _below_iid(kinds: list[Errors], terms: Mapping[int, str]) -> list[str]:
 def _wald(
     term: str, estimate: float, j: int, kind: Errors, iid_errors: Float[np.ndarray, " k"], level: float
 ) -> dict[str, Any]:
-    """Table row of coefficient j with one kind of error, by t (normal for iid)."""
+    """Table row of coefficient j with one kind of error, by t (normal for iid). Without an interval if the error is 0
+    up to rounding."""
     error, dof = float(kind.std_errors[j]), kind.covariance.degrees_of_freedom
     if error <= _NO_SPREAD * iid_errors[j]:
         return _row(term, estimate, kind.name, f"{kind.assumes}; {_NOTHING_LEFT}", degrees_of_freedom=dof)
@@ -205,7 +210,8 @@ def _wald(
 def _profiled(
     model: Design, j: int, term: str, start: np.ndarray, separated: Separation, level: float | None, unit: float
 ) -> dict[str, Any]:
-    """Table row of a coefficient without a finite estimate; no interval if `level` is None. `unit`: of its column."""
+    """Table row of coefficient j, which has no finite estimate; no interval if `level` is None. `unit`: by which its
+    column was divided."""
     low, high, p_value = (np.nan,) * 3 if level is None else profile(model, j, start, separated, level)
     both = separated.rises[j] and separated.falls[j]
     estimate = np.nan if both else np.inf if separated.rises[j] else -np.inf
@@ -214,7 +220,7 @@ def _profiled(
 
 
 def _separated_sentence(names: list[str], separated: Separation, effects: int) -> str:
-    """Warning that names the separated coefficients."""
+    """Warning that names the separated coefficients, of the first `effects` if any of them is separated."""
     infinite = [name for name, without in zip(names, separated.infinite, strict=True) if without]
     shown = [name for name in infinite if name in names[:effects]] or infinite
     return (
@@ -235,7 +241,8 @@ def _row(term: str, estimate: float, errors: str, assumes: str, **numbers: float
 
 
 def _tidy(rows: list[dict[str, Any]], names: list[str], effects: int) -> pd.DataFrame:
-    """Table of the rows in the order of their terms; edges of categories get no odds ratio."""
+    """The rows as a table in the order of `names`; those from index `effects` on (edges of categories) get no odds
+    ratio."""
     table = pd.DataFrame(rows)
     table.loc[table["term"].isin(names[effects:]), ["odds_ratio", "odds_low", "odds_high"]] = np.nan
     order = {name: place for place, name in enumerate(names)}

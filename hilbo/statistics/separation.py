@@ -63,7 +63,7 @@ def separation(model: Design) -> Separation:
 
 
 def independent(model: Design) -> Bool[np.ndarray, " k"]:
-    """Mask of the columns that are linearly independent of those before them, over the finite edges."""
+    """Mask of the columns that are linearly independent of the selected ones before them, over the finite edges."""
     rows = _constraints(model)
     keep = np.zeros(model.upper.shape[1], bool)
     rank = 0
@@ -75,7 +75,7 @@ def independent(model: Design) -> Bool[np.ndarray, " k"]:
 
 
 def supremum(model: Design, start: Float[np.ndarray, " k"], separated: Separation) -> float:
-    """Supremum of the log-likelihood, attained or not."""
+    """Supremum of the log-likelihood, attained or not; 0 if all responses are certain."""
     if separated.certain.all():
         return 0.0
     rest, _, rest_start = decisive(model, start, separated)
@@ -87,7 +87,8 @@ def supremum(model: Design, start: Float[np.ndarray, " k"], separated: Separatio
 def decisive(
     model: Design, start: Float[np.ndarray, " k"], separated: Separation
 ) -> tuple[Design, Bool[np.ndarray, " k"], Float[np.ndarray, " j"]]:
-    """Design of the responses that are not certain, mask of the coefficients that they determine, and a start.
+    """Design of the responses that are not certain, in the coefficients that they determine; a mask of these among all
+    (k,); and a start for them (j,).
 
     Edges that go to infinity are open. A coefficient that is left out is 0: the remaining edges depend on it only
     through the others.
@@ -136,7 +137,8 @@ def profile(
 
 
 def _constraints(model: Design) -> Float[np.ndarray, "r k"]:
-    """Rows a with a·δ >= 0 for every direction δ that does not lower the likelihood: upper edges, then lower ones."""
+    """Rows a with a·δ >= 0 for every direction δ that does not lower the likelihood: finite upper edges, then finite
+    lower ones."""
     has_upper, has_lower = np.isfinite(model.upper_offset), np.isfinite(model.lower_offset)
     return np.vstack([model.upper[has_upper], -model.lower[has_lower]])
 

@@ -29,7 +29,7 @@ class Study(eqx.Module):
     gp: OrdinalGP
     space: SearchSpace
     file: StudyFile = eqx.field(static=True)
-    """All that the study file contains: responses, selection, texts and so on."""
+    """Content of the study file: responses, selection, texts and so on."""
     rule: str = eqx.field(static=True)
     """Name of the aggregation method: the file's, or one to compare with it."""
     inference: Inference = eqx.field(static=True)

@@ -1,4 +1,4 @@
-"""What the results of one material say: regions, tolerances, comparison of rules, checks of the model.
+"""Analyses of one material: credible region, tolerances, comparison of aggregation methods, model check.
 
 Records for reports, tables and figures, which compute nothing themselves.
 """

@@ -1,9 +1,9 @@
-"""Everything that a study's results say of one material, computed once for report, tables and figures.
+"""All results of one material, computed once for report, tables and figures.
 
-Exclusion comes first: everybody's answers are measured (`hilbo.population.judged.response_quality`), the study's rule
-is applied, and only then is anything aggregated. Then: the aggregate, the optima after fewer trials, best, mid and
-worst, tolerance intervals under the study's hyperparameters and under those of maximum evidence, with their bootstrap
-over people. What cannot be had from these answers is a sentence in `limits`, not an error.
+Exclusion comes first: each participant's response quality is measured (`hilbo.population.judged.response_quality`), the
+study's rule is applied, and only then are responses aggregated. Then: the aggregate, the optima after fewer trials,
+best, mid and worst, tolerance intervals with the study's hyperparameters and with those of maximum marginal likelihood,
+with their bootstrap over participants. Results that these responses do not allow are sentences in `limits`, not errors.
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ _LEARN = ("theta", "noise", "thresholds")
 
 
 class Reading(NamedTuple):
-    """A population map and what is read from it: tolerance interval and its ends' bootstrap for each parameter."""
+    """A population map with the tolerance interval of each parameter and the bootstrap of its ends."""
 
     study: Study
     aggregate: Aggregate
@@ -58,12 +58,13 @@ class Analysis(NamedTuple):
     maximum: MaximumEvidence
     sets: Sets | None
     people: pd.DataFrame
-    """Everybody's measures, those left out too."""
+    """Response quality of all participants, also of those excluded."""
     left_out: dict[str, str]
-    """Who was left out by the study's rule, and why."""
+    """Participant excluded by the study's rule -> reason."""
     limits: tuple[str, ...]
     comparison: Content | None
-    """Every rule of aggregation (`rule_comparison.compare`); None if it was not asked, or people are too few."""
+    """Comparison of all aggregation methods (`rule_comparison.compare`); None if not requested, or with fewer than
+    three participants."""
 
     @property
     def study(self) -> Study:
@@ -72,25 +73,26 @@ class Analysis(NamedTuple):
 
     @property
     def cohort(self) -> Cohort:
-        """The participants whose answers were aggregated."""
+        """The participants that were aggregated, without the excluded ones."""
         return self.population.cohort
 
     @property
     def aggregate(self) -> Aggregate:
-        """The population's results under the study's own hyperparameters."""
+        """The aggregate under the study's own hyperparameters."""
         return self.population.aggregate
 
     @property
     def progress(self) -> Progress:
-        """The optima after fewer trials."""
+        """The optima after fewer trials; waits until they are computed."""
         return self.population.progress
 
 
 def analyse(
     study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda text: None, *, comparison: bool = False
 ) -> Analysis:
-    """Results of one material from all its participants' answers. `comparison`: every rule of aggregation with each
-    person left out in turn, which is most of the work. Raises `InputError` if the rule leaves nobody."""
+    """All results of one material. `everybody`: all its participants, before exclusion; `say`: called with a phrase at
+    the start of each step; `comparison`: also cross-validate all aggregation methods, which is the slowest step. Raises
+    `InputError` if all participants are excluded."""
     say("consistency, lapses and drift of everybody")
     cohort, people, left_out = included(study, everybody)
     population = _with_learnt(analyse_cohort(study, cohort, seed, say), seed, say)
@@ -120,7 +122,8 @@ def analyse(
 
 
 def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
-    """What these answers cannot say, in sentences."""
+    """Sentences on the limits of the data: a single participant, few or unequal numbers of responses, participants who
+    gave one response only, fewer trials than planned."""
     counts, sentences = cohort.counts(), []
     if len(cohort.names) == 1:
         sentences.append(
@@ -150,7 +153,7 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
 
 
 def _compared(study: Study, aggregate: Aggregate, seed: int, say: Say) -> Content | None:
-    """Every rule beside the study's; None where people are too few."""
+    """Comparison of all aggregation methods; None for fewer than three participants with responses."""
     if np.sum(aggregate.cohort.counts() > 0) < FEWEST:
         return None
     say("comparing the rules of aggregation")
@@ -158,7 +161,8 @@ def _compared(study: Study, aggregate: Aggregate, seed: int, say: Say) -> Conten
 
 
 def _with_learnt(population: CohortResults, seed: int, say: Say) -> CohortResults:
-    """With the optimum by the recommended recipe among the alternatives, where the study's rule learns nothing."""
+    """The same results with map and optimum by the recommended method added to the alternatives; unchanged if the
+    study's method learns."""
     study, aggregate = population.study, population.aggregate
     if RULES[study.rule].learns:
         return population
@@ -176,7 +180,8 @@ def _with_learnt(population: CohortResults, seed: int, say: Say) -> CohortResult
 
 
 def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Judged, Study, Aggregate]:
-    """The hyperparameters of maximum evidence, the study with them, and its aggregate."""
+    """Hyperparameters of maximum marginal likelihood, the study with them (and a method for given hyperparameters), and
+    its aggregate."""
     judged = maximise_judged(study.gp, cohort.trials, _LEARN, inference=study.inference)
     maximum = judged.maximum
     optimised_study = dataclasses.replace(study, gp=maximum.gp, rule=_given_rule(study.rule, cohort), learnt=None)
@@ -184,7 +189,7 @@ def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Judged, Study, 
 
 
 def _given_rule(name: str, cohort: Cohort) -> str:
-    """The rule itself, or of one that learns the hyperparameters what stands for it where they are given."""
+    """The method itself, or the method with given hyperparameters that replaces one that learns them."""
     if not RULES[name].learns:
         return name
     by_points = RULES[RULES[name].pointwise]
@@ -192,7 +197,7 @@ def _given_rule(name: str, cohort: Cohort) -> str:
 
 
 def _reading(study: Study, aggregate: Any, seed: int) -> Reading:
-    """Tolerance intervals through the map's optimum, along every parameter that is no choice of levels."""
+    """Tolerance intervals through the map's optimum, with their bootstrap, for every parameter without levels."""
     x = aggregate.optimum.x
     rule, share = point_rule(study.rule, aggregate.map.share)
     return Reading(
@@ -209,7 +214,7 @@ def _reading(study: Study, aggregate: Any, seed: int) -> Reading:
 
 
 def _best_mid_worst(study: Study, aggregate: Aggregate, seed: int) -> tuple[Sets | None, tuple[str, ...]]:
-    """The three sets; where the map has none, the sentence that says why."""
+    """Best, mid and worst stimulus and (); or None and one sentence with the reason why there are none."""
     try:
         candidates = search_points(study.space, seed)
         return best_mid_worst(study, aggregate.surface, candidates, prior=aggregate.map.map_prior), ()
@@ -218,7 +223,8 @@ def _best_mid_worst(study: Study, aggregate: Aggregate, seed: int) -> tuple[Sets
 
 
 def _aggregated_otherwise(map_: RuleMap) -> Iterator[str]:
-    """A sentence where what stands beside the map is aggregated otherwise."""
+    """Yield sentences on results that are not aggregated like the map: by another method, or without the random
+    effect."""
     how = in_place(map_)
     if how:
         yield (
@@ -234,7 +240,7 @@ def _aggregated_otherwise(map_: RuleMap) -> Iterator[str]:
 
 
 def moved_by_evidence(analysis: Analysis) -> float:
-    """NRMSE between the optima under fixed and under optimised hyperparameters."""
+    """NRMSE between the optima with the study's hyperparameters and with those of maximum marginal likelihood."""
     return float(
         nrmse(analysis.optimised.aggregate.optimum.x, analysis.aggregate.optimum.x, analysis.study.gp.kernel.levels)
     )

@@ -1,7 +1,7 @@
-"""Where the population optimum would be, had other people of this kind been asked: a bootstrap over people.
+"""Bootstrap over participants: location of the population optimum in resamples of the participants.
 
-The map of each resample is aggregated from the same posteriors, and its maximum sought among given points: nothing is
-fitted again.
+The map of each resample is aggregated from the same posteriors, and its maximum is searched among given points: nothing
+is fitted again.
 """
 
 import jax
@@ -18,7 +18,7 @@ __all__ = ["can_resample", "resampled_tops"]
 
 
 def can_resample(posteriors: Posterior) -> bool:
-    """Whether at least two people answered: of one person all resamples are the same, as if others could not differ."""
+    """Whether at least two participants have responses: with one, all resamples would be the same."""
     return int(np.any(np.asarray(posteriors.trials.mask), axis=1).sum()) > 1
 
 
@@ -31,10 +31,11 @@ def resampled_tops(
     seed: int = 0,
     draws: int = 200,
 ) -> Int[np.ndarray, " draws"]:
-    """For each resample of the people, the row of `points` (unit cube) where their map is highest.
+    """Bootstrap over participants: for each resample the row of `points` (unit cube) where its map is highest.
+    (draws,).
 
-    **Arguments:** `rule`: one of `POINTWISE`; `share`: of the hierarchical rule, else None; `prior`: variance of
-    the map where nobody answered.
+    **Arguments:** `rule`: a method of `POINTWISE`; `share`: shared variance fraction of the hierarchical one, otherwise
+    None; `prior`: variance of the map without responses, a scalar.
     """
     people = posteriors.trials.mask.shape[0]
     rows = np.random.default_rng(seed).integers(0, people, (draws, people))
@@ -50,6 +51,7 @@ def _tops(
     share: ArrayLike | None,
     prior: Float[Array, ""],
 ) -> Int[Array, " draws"]:
+    """Compiled `resampled_tops`; `rows`: participants of each resample."""
     means, explained = jax.lax.map(lambda person: person.predict_explained(points), posteriors)
 
     def one(chosen: Int[Array, " M"]) -> Int[Array, ""]:

@@ -1,8 +1,7 @@
-"""What the answers of one cohort say, computed once: the aggregate, how it came about over the trials, the region of
-the optimum and the model check.
+"""Results of one cohort: the aggregate, its convergence over the trials, the region of the optimum and the model check.
 
-`hilbo aggregate` writes these. `hilbo.study.analysis.analysis` adds what a report says besides, and takes longer to
-import.
+`hilbo aggregate` writes these. `hilbo.study.analysis.analysis` adds the further results of a report, and takes longer
+to import.
 """
 
 from collections.abc import Callable
@@ -27,26 +26,26 @@ Say = Callable[[str], None]
 
 
 class CohortResults(NamedTuple):
-    """What the answers of one cohort say, and how it came about over the trials: what `hilbo aggregate` writes."""
+    """Results of one cohort that `hilbo aggregate` writes; convergence over the trials is computed in a thread."""
 
     study: Study
     aggregate: Aggregate
     following: Future[Progress] | None
-    """What becomes `progress`: computed beside what is read from the aggregate; None if it was not asked."""
+    """The running computation of `progress`; None if not requested."""
     seed: int
     region: Region | None
-    """Where the optimum is, with its probability; None for a map without a joint posterior, and if it was not asked."""
+    """Credible region of the optimum; None for a map without a joint posterior, or if not requested."""
     check: Content | None
-    """Whether the model fits (`model_check`); None if it was not asked."""
+    """Results of the model check (`model_check`); None if not requested, or with fewer than three participants."""
 
     @property
     def cohort(self) -> Cohort:
-        """Whose answers these are."""
+        """The participants and their responses."""
         return self.aggregate.cohort
 
     @property
     def progress(self) -> Progress:
-        """The optima after fewer trials; waits for them. Raises `InputError` if they were not asked."""
+        """Optima after fewer trials; waits until they are computed. Raises `InputError` if they were not requested."""
         if self.following is None:
             raise InputError("CohortResults: the optima after fewer trials were not asked; analyse with whole=True.")
         return self.following.result()
@@ -63,11 +62,11 @@ def analyse_cohort(
     individuals: bool = True,
     count: SayCount = lambda words, done, people: None,
 ) -> CohortResults:
-    """The aggregate of a cohort, and its optima after fewer trials, which a thread goes on to compute; everything is
-    fitted once.
+    """Aggregate a cohort and analyse the map; returns while a thread computes the optima after fewer trials.
 
-    **Arguments:** `tell`: given the optimum in sentences as soon as it is known; `whole`: False for the aggregate
-    alone, as for many participants; `individuals`, `count`: as `individuals` and `say` of `aggregate_cohort`.
+    **Arguments:** `say`: called with a phrase at the start of each step; `tell`: called with sentences on the optimum
+    as soon as it is known; `whole`: False for the aggregate alone, as for many participants; `individuals`, `count`: as
+    `individuals` and `say` of `aggregate_cohort`.
     """
     if RULES[study.rule].learns:
         say("learning the hyperparameters from all answers")

@@ -1,7 +1,8 @@
-"""What each parameter does to a population map: along a slice through the optimum, and on average over the others.
+"""Effect of each parameter on a population map: along a slice through the optimum, and averaged over the other
+parameters.
 
-The *main effect* of a value is the mean of the map over even points of the feasible set whose coordinate is that value,
-as far as they may then be rendered (partial dependence; Friedman 2001, Ann. Statist. 29:1189, section 8.2).
+The *main effect* of a value is the mean of the map over even points of the feasible set whose coordinate is set to that
+value, without those that become infeasible (partial dependence; Friedman 2001, Ann. Statist. 29:1189, section 8.2).
 """
 
 from collections.abc import Callable
@@ -20,8 +21,8 @@ _VALUES, _POINTS = 33, 128  # along a continuous parameter, and even points that
 
 
 class Effect(NamedTuple):
-    """Of one parameter: values in physical units (k,), the map's mean and sd (k,) along the slice, and the main effect
-    (k,); NaN where nothing may be rendered."""
+    """Effect of one parameter: values in physical units (k,), the map's mean and sd (k,) along the slice, and the main
+    effect (k,); NaN where the points are infeasible."""
 
     parameter: str
     values: Float[np.ndarray, " k"]
@@ -31,19 +32,22 @@ class Effect(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Range of the main effect."""
+        """Range (maximum - minimum) of the main effect, without NaN."""
         return float(np.nanmax(self.average) - np.nanmin(self.average))
 
 
 def effects_of(
     study: Study, surface: Callable[..., Any], optimum: Float[np.ndarray, " d"], seed: int = 0
 ) -> tuple[Effect, ...]:
-    """The effects of all parameters on a map. `surface`: mean and variance (m,) at points (m, d) of the unit cube."""
+    """Effects of all parameters on a map, in their order. `surface`: function of points (m, d) of the unit cube that
+    returns mean and variance (m,); `optimum` (d,): point through which slices go."""
     points = study.space.candidates(_POINTS, seed)
     return tuple(_effect(study, surface, np.asarray(optimum), points, i) for i in range(study.space.dim))
 
 
 def _effect(study, surface, optimum, points, i) -> Effect:
+    """Effect of the parameter with index `i`; `points` (n, d): feasible points over which the main effect is
+    averaged."""
     parameter = study.space.parameters[i]
     axis = parameter.axis(_VALUES)
     along, allowed = slice_through(study, jnp.asarray(optimum), parameter.name, jnp.asarray(axis))

@@ -1,4 +1,5 @@
-"""What result.json says of the rule by which people were aggregated, and a warning where its assumptions fail."""
+"""Differences between participants, for result.json, and a warning if the aggregation method assumes that there are
+none."""
 
 import math
 from typing import Any
@@ -19,12 +20,13 @@ _TOO_SURE = 1.5  # times as large as the map says: a standard deviation worth a 
 
 
 def heterogeneity(aggregate: Any) -> dict[str, Any] | None:
-    """How people differ, for result.json; None where it was not asked."""
+    """`share_content` of an aggregate, for result.json; None if its shared variance fraction was not estimated."""
     return None if aggregate.share is None else share_content(aggregate.share)
 
 
 def share_content(share: Share) -> dict[str, Any]:
-    """A learnt share as plain numbers."""
+    """Estimate of the shared variance fraction as a dict of plain numbers: mean, mode, 95 % interval, log Bayes factor
+    against identical participants, convergence."""
     return {
         "share": float(share.mean),
         "most_probable": float(share.best),
@@ -35,7 +37,8 @@ def share_content(share: Share) -> dict[str, Any]:
 
 
 def in_place(map_: RuleMap) -> str:
-    """How maps of fewer trials, and of bootstrap resamples, are aggregated where that differs; else nothing."""
+    """How maps of fewer trials and of bootstrap resamples are aggregated, as a phrase such as "by bcm"; "" if as the
+    map itself."""
     rule = RULES[map_.rule]
     if map_.method == "by points":
         return ""
@@ -45,7 +48,8 @@ def in_place(map_: RuleMap) -> str:
 
 
 def rule_warnings(study: Study, aggregate: Any) -> list[str]:
-    """A sentence where the study's rule takes people to be alike and the answers say that they are not."""
+    """A list with one warning if the study's method assumes identical participants and the responses show differences
+    (log Bayes factor of 3 or more); otherwise empty."""
     share = aggregate.share
     if share is None or not RULES[study.rule].homogeneous or float(share.against_one) < SURE:
         return []
@@ -65,7 +69,8 @@ def rule_warnings(study: Study, aggregate: Any) -> list[str]:
 
 
 def _sd_ratio(aggregate: Any) -> float | None:
-    """The hierarchical map's standard deviation over the map's, at the optimum."""
+    """Standard deviation of the hierarchical map divided by that of the map, at the map's optimum; None without the
+    former."""
     if aggregate.hierarchical is None:
         return None
     _, variance = predict_map(aggregate.hierarchical, to_device(np.asarray(aggregate.optimum.x)[None, :]))

@@ -1,10 +1,10 @@
-"""Hills of a population map, and with what probability the best rendering is on each.
+"""Modes (hills) of a population map, and the probability that the best stimulus is at each.
 
-Even points of the map are added from the highest down. A point joins the hill of its higher neighbours; one that has
-none begins a hill; where two hills meet, the lower one is part of the other if its top is above the meeting place by
-less than the map's standard deviation at that top: a dip that the answers do not show. Joint draws of the map then say
-how often the largest value of all is on each hill. Its *centre* is the mean of the places where it was, of unordered
-levels the likeliest.
+Even points of the map are added from the highest down. A point joins the hill of its higher neighbours; one without any
+begins a new hill; where two hills meet, the lower one is merged into the other if its top is above the meeting point by
+less than the map's standard deviation at that top, which is a dip that the responses do not show. Joint draws of the
+map then give the frequency with which the maximum is on each hill. Its *centre* is the mean of these maxima, of
+unordered levels the most frequent.
 
 Reference: Edelsbrunner & Harer (2010), Computational Topology, chapter VII, for tops and the places where they merge.
 """
@@ -24,12 +24,13 @@ _LEAST = 0.01  # of the draws: what is rarer is no hill to speak of
 
 
 class Hill(NamedTuple):
-    """Points of the box coordinates in which the feasible set is a cube."""
+    """A mode of the map: its highest point and the mean of the draws' maxima on it, in box coordinates (in which the
+    feasible set is a cube)."""
 
     top: Float[np.ndarray, " d"]
     centre: Float[np.ndarray, " d"]
     probability: float
-    """That the best rendering is on it."""
+    """Posterior probability that the best stimulus is on it."""
 
 
 def hills_of(
@@ -39,8 +40,12 @@ def hills_of(
     weight: Float[np.ndarray, " m"],
     kernel: Stationary,
 ) -> tuple[Hill, ...]:
-    """Hills by falling probability, from even points of the box, the map's mean and standard deviation, and the share
-    of draws that are largest there; `kernel`: by whose distance points are near."""
+    """Hills in the order of falling probability, without those below 0.01.
+
+    `points` (m, d): even points in box coordinates; `height`, `sd` (m,): the map's mean and standard deviation there;
+    `weight` (m,): fraction of joint draws that are largest at each point; `kernel`: its length scales define the
+    distance of points.
+    """
     tops = _tops(embedded(kernel, points), height, sd)
     hills = []
     for top in np.unique(tops):
@@ -58,7 +63,8 @@ def hills_of(
 def _tops(
     scaled: Float[np.ndarray, "m d"], height: Float[np.ndarray, " m"], sd: Float[np.ndarray, " m"]
 ) -> Int[np.ndarray, " m"]:
-    """For each point the top of its hill."""
+    """Index of the top of the hill that each point belongs to, (m,). `scaled`: points in length scales of the
+    kernel."""
     count, d = scaled.shape
     _, near = KDTree(scaled).query(scaled, min(3**d * _AROUND, _MOST, count))
     joined = list(range(count))  # to the top of a hill, or of one that this hill became part of

@@ -1,11 +1,12 @@
-"""Does the model fit? What a study's rule predicts of people who are left out, beside what they answered.
+"""Model check: cross-validated predictions of left-out participants, compared with their responses.
 
-Everybody who answered is left out once, alone or in a group where people are many or folds dear, and predicted from the
-others' answers and, answer by answer, from their own earlier ones: a session chooses renderings by these, so without
-them a model that fits would seem not to. The hyperparameters stay. Compared are the shares of the answers (of all, of
-everybody, and of the thirds of a session), how often repeated renderings get the same answer, and the density of the
-answers beside that of two predictions from the others' answers alone that know nothing of maps
-(`hilbo.population.judged.baselines`). Errors are clustered by person, and not below what the probabilities imply.
+Every participant is left out once, alone or in a group if there are many or folds are slow, and predicted from the
+others' responses and, response by response, from their own earlier ones: a session chooses stimuli by these, so that
+without them a model that fits would seem not to. The hyperparameters are kept. Compared are the proportions of the
+responses (overall, per participant, and per third of a session), the test-retest agreement at repeated stimuli, and the
+predictive density with that of two baselines without a map, fitted to the others' responses
+(`hilbo.population.judged.baselines`). Errors are clustered by participant, and not below those that the predicted
+probabilities imply.
 """
 
 import numpy as np
@@ -27,7 +28,7 @@ _GROUPS = 12  # of people, in which the baselines leave them out
 
 
 def model_check(study: Study, aggregate: Aggregate) -> Content | None:
-    """For result.json; None for fewer than three people with answers."""
+    """Results of the model check as a dict for result.json; None for fewer than three participants with responses."""
     cohort = aggregate.cohort
     answered = np.flatnonzero(cohort.counts() > 0)
     if len(answered) < 3:
@@ -62,7 +63,8 @@ def model_check(study: Study, aggregate: Aggregate) -> Content | None:
 
 
 def check_sentences(content: Content | None) -> list[str]:
-    """At most one sentence, with every misfit; [] if there is none, or nothing was checked (`content` None)."""
+    """A list of at most one sentence, with all misfits; empty if there are none, or if nothing was checked (`content`
+    None)."""
     if content is None:
         return []
     wrong = [
@@ -87,11 +89,13 @@ def check_sentences(content: Content | None) -> list[str]:
 
 
 def _percent(share: float) -> str:
+    """A fraction as text in whole percent."""
     return f"{100 * share:.0f} %"
 
 
 def _left_out(study: Study, aggregate: Aggregate, answered: np.ndarray) -> LeftOut:
-    """Alone, or in groups of people from all over the table where they would be too many folds."""
+    """Cross-validated predictions, each participant left out alone, or in at most 24 groups (6 for slow methods).
+    `answered`: rows of participants with responses."""
     trials = aggregate.cohort.trials
     cheap = RULES[study.rule].learns or aggregate.map.method == "by points"
     folds = min(_FOLDS if cheap else _DEAR_FOLDS, len(answered))
@@ -111,12 +115,13 @@ def _left_out(study: Study, aggregate: Aggregate, answered: np.ndarray) -> LeftO
 
 
 def _people(left: LeftOut) -> list[int]:
-    """Rows of the cohort, in the order of the predictions."""
+    """Rows of the participants in the cohort, in the order of the predictions."""
     return list(dict.fromkeys(left.person.tolist()))
 
 
 def _shares(study: Study, left: LeftOut, chosen: Float[np.ndarray, "n C"], rows: np.ndarray) -> Content:
-    """Of every answer: the share that was given and predicted, and the error of the difference."""
+    """For each response its observed and predicted proportion and the error of the difference, over the selected
+    `rows`. `chosen`: one-hot responses."""
     return {
         label: _compared(chosen[rows, c], left.probabilities[rows, c], left.person[rows])
         for c, label in enumerate(study.responses)
@@ -126,21 +131,24 @@ def _shares(study: Study, left: LeftOut, chosen: Float[np.ndarray, "n C"], rows:
 def _compared(
     given: Float[np.ndarray, " n"], predicted: Float[np.ndarray, " n"], person: np.ndarray
 ) -> dict[str, float]:
-    """Means of what happened (0 or 1) and of its probability; the error of their difference is by person, or what the
-    probabilities themselves imply, if that is larger: where few answers are all the same, the former is too small."""
+    """Mean of outcomes (0 or 1) and of their probabilities, as "given" and "predicted", and "error", the standard error
+    of the difference: clustered by participant, or as the probabilities imply if that is larger, because few equal
+    responses make the former too small."""
     _, error = clustered(given - predicted, person)
     implied = float(np.sqrt(np.sum(predicted * (1.0 - predicted)))) / len(given)
     return {"given": float(given.mean()), "predicted": float(predicted.mean()), "error": float(np.fmax(error, implied))}
 
 
 def _differs(row: Content) -> bool:
+    """Whether observed and predicted differ by more than 0.05 and by more than two errors."""
     gap = abs(row["given"] - row["predicted"])
     return gap > _WORTH and gap > _ERRORS * row["error"]
 
 
 def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> Content | None:
-    """Answers of one person to a rendering that they had before (with a random effect in one context, a column of x):
-    how often they are what the last one there was, and how often they should be."""
+    """Test-retest agreement: number of pairs of consecutive responses of a participant to the same stimulus, and their
+    observed and predicted agreement. None without pairs. `x`: stimuli, with the context of a random effect as a further
+    column."""
     same, expected, person = [], [], []
     for p in _people(left):
         rows = np.flatnonzero(left.person == p)
@@ -157,7 +165,8 @@ def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> Content | None:
 
 
 def _densities(left: LeftOut, x: Float[np.ndarray, "n d"], categories: int) -> Content:
-    """Mean negative log density of the answers, by the map; by the baselines, and what they cost more than the map."""
+    """Mean negative log density (nats per response) of the map, and of each baseline with its difference from the map's
+    and the error of that."""
     _, place = np.unique(left.person, return_inverse=True)
     groups = place % _GROUPS
     costs = {name: np.empty(len(left.q)) for name in _BASELINES}

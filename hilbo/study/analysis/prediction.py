@@ -1,4 +1,4 @@
-"""What a study predicts at renderings in physical units: from a DataFrame to a DataFrame.
+"""Predictions of a study at stimuli in physical units, from a DataFrame to a DataFrame.
 
 predicted = predict_table(study, aggregate, pd.DataFrame({"K1": [5.6], "B1": [7.9], "alpha": [0.18]}))
 """
@@ -18,16 +18,18 @@ __all__ = ["predict_table"]
 
 
 def predict_table(study: Study, model: Posterior | Aggregate, table: pd.DataFrame) -> pd.DataFrame:
-    """The table with what is predicted in each row: `mean` and `sd` of the latent function, and for every response of
-    the study the probability of that answer, in a column `P(response)`.
+    """Copy of the table with predictions for each row: `mean` and `sd` of the latent function, and for every response
+    of the study its probability, in a column `P(response)`.
 
     **Arguments:**
 
     - `model`: one participant's [`Posterior`][]; or a study's [`Aggregate`][]: mean and standard deviation are then
-      the population map's, and the answers those of a new participant.
-    - `table`: a column for each of the study's parameters, in its units; other columns and the index stay.
+      the population map's, and the responses those of a new participant.
+    - `table`: a column for each of the study's parameters, in its units, levels by name; other columns and the index
+      are kept.
 
-    Raises `InputError` for a column that is missing, and values that are no numbers of the study's ranges.
+    Raises `InputError` for another type of model, several participants' posteriors, a missing column, and values
+    outside the study's ranges.
     """
     x = _points(study, table)
     if isinstance(model, Posterior):
@@ -46,7 +48,7 @@ def predict_table(study: Study, model: Posterior | Aggregate, table: pd.DataFram
 
 
 def _points(study: Study, table: pd.DataFrame) -> jnp.ndarray:
-    """The rows as points (m, d) of the unit cube."""
+    """The rows as points (m, d) of the unit cube. Raises InputError for a missing column or an invalid value."""
     text = cells_of(table)
     missing = [name for name in study.space.names if name not in text]
     if missing:

@@ -1,11 +1,11 @@
-"""How optima come about: the population's and everybody's own after everybody's first 1, 2, ... trials.
+"""Convergence of optima over trials: the population's and each participant's optimum after the first 1, 2, ... trials.
 
 A prefix of the trials is fitted like any cohort and searched from the same candidates; the last point is the aggregate
-itself, which is fitted already. Maps of prefixes are aggregated point by point: by the study's rule, or by bcm
-where the rule takes all answers at once.
+itself, which is not fitted again. Maps of prefixes are aggregated point by point: by the study's method, or by its
+pointwise counterpart if it takes all responses at once.
 
-The way to one's own last place ends at 0 whatever the answers. So people are also split into random halves, which share
-nobody: how far is the optimum of one half, after fewer trials, from that of the other half after all?
+The distance to the final optimum ends at 0 whatever the responses. So participants are also split into random halves:
+what is the distance of the optimum of one half, after fewer trials, from that of the other half after all trials?
 """
 
 from collections.abc import Sequence
@@ -40,53 +40,56 @@ _MOMENTS = (5, 15, 25)  # numbers of trials whose maps are drawn, as in the pape
 
 
 class Progress(NamedTuple):
-    """Optima (unit cube) after the first `counts` trials of everybody: the population's, and each person's."""
+    """Optima (unit cube) after the first `counts` trials of each participant: the population's, and the individual
+    ones."""
 
     counts: Int[np.ndarray, " p"]
     population: Float[np.ndarray, "p d"]
     individual: Float[np.ndarray, "p M d"]
     ends: Int[np.ndarray, " M"]
-    """How many answers each person gave."""
+    """Number of responses of each participant."""
     halves: Float[np.ndarray, "p s"]
-    """NRMSE of the optimum of one half of the people to the other half's after all trials, for every split and side."""
+    """NRMSE of the optimum of one half of the participants to the other half's after all trials, for every split and
+    side."""
     individual_to_half: Float[np.ndarray, "p M"]
-    """The same of each person's own optimum, to the half without that person; median over the splits."""
+    """NRMSE of each individual optimum to that of the half without the participant; median over the splits."""
     maps: dict[int, RuleMap]
-    """The population's map, with everybody's posteriors in it, after some of `counts`: those that are drawn."""
+    """Number of trials -> population map with all posteriors, for the numbers of trials that figures show."""
     levels: tuple[int, ...] = ()
-    """As the kernel has them."""
+    """Numbers of levels per parameter, as in the kernel."""
 
     @property
     def splits(self) -> int:
-        """How many optima of halves there are; 0 where people were too few to be split."""
+        """Number of optima of halves, two per split; 0 if there were too few participants to split."""
         return self.halves.shape[1]
 
     @property
     def moments(self) -> list[int]:
-        """The numbers of trials after which there is a map."""
+        """Numbers of trials for which a map was kept."""
         return list(self.maps)
 
     def at(self, counts: Sequence[int]) -> Int[np.ndarray, " k"]:
-        """Rows of these numbers of trials."""
+        """Row index of each of these numbers of trials in `counts`; they must be in it."""
         return np.searchsorted(self.counts, counts)
 
     def person(self, row: int) -> dict[int, Posterior]:
-        """One participant's posterior at each of the moments."""
+        """One participant's posterior at each of the moments: number of trials -> posterior. `row`: of the cohort."""
         return {count: jax.tree.map(lambda leaf: leaf[row], map_.experts) for count, map_ in self.maps.items()}
 
     def to_end(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p M"]]:
-        """NRMSE of the population's and of everybody's running optimum to the final one; a person's is NaN beyond their
-        last answer, where it cannot move."""
+        """NRMSE (p,) of the population's running optimum to the final one, and (p, M) of each participant's; NaN at
+        numbers of trials beyond the participant's last response."""
         population = np.asarray(nrmse(self.population, self.population[-1], self.levels))
         individual = np.asarray(nrmse(self.individual, self.individual[-1], self.levels))
         return population, np.where(self.counts[:, None] <= self.ends[None, :], individual, np.nan)
 
 
 def follow(study: Study, aggregated: Aggregate, seed: int = 0, counts: Sequence[int] | None = None) -> Progress:
-    """The optima of the aggregate's cohort after fewer trials, by the hyperparameters of `study`.
+    """Optima of the aggregate's cohort after fewer trials, with the hyperparameters of `study`. Two numbers of trials
+    are computed at a time, in threads.
 
-    `counts`: numbers of trials, ascending; by default at most 25 of them up to the longest session. The longest is
-    always the last, and is not fitted again.
+    `counts`: numbers of trials, ascending; by default about 25, and each participant's last. The longest session is
+    always added, and is not fitted again. Raises `InputError` if the aggregate has no individual optima.
     """
     cohort = aggregated.cohort
     ends = cohort.counts()
@@ -119,7 +122,7 @@ def follow(study: Study, aggregated: Aggregate, seed: int = 0, counts: Sequence[
 
 
 def _splits(people: int, seed: int) -> Bool[np.ndarray, "s M"]:
-    """Who is in the first half, of every split; no split where a half would be one person."""
+    """Membership of the first half in each of 50 random splits, (s, M); s = 0 for fewer than four participants."""
     if people < _FEWEST:
         return np.zeros((0, people), bool)
     rng = np.random.default_rng(seed)
@@ -128,7 +131,7 @@ def _splits(people: int, seed: int) -> Bool[np.ndarray, "s M"]:
 
 
 def _tops(map_: RuleMap, points: Float[Array, "m d"], split: Bool[np.ndarray, "s M"]) -> Int[np.ndarray, "s 2"]:
-    """Of both halves of every split, the row of the point where the half's map is highest."""
+    """Row of the point where the map of each half is highest, (s, 2), the first half first."""
     if not len(split):
         return np.zeros((0, 2), int)
     sides = np.stack([split, ~split], axis=1).reshape(-1, split.shape[1])
@@ -137,7 +140,7 @@ def _tops(map_: RuleMap, points: Float[Array, "m d"], split: Bool[np.ndarray, "s
 
 @program
 def _highest(map_: RuleMap, points: Float[Array, "m d"], sides: Bool[Array, "k M"]) -> Int[Array, " k"]:
-    """For each choice of people, the row of the point where their map is highest."""
+    """Row of the point where the map of each subset of participants is highest. `sides` (k, M): membership."""
     means, explained = jax.lax.map(lambda person: person.predict_explained(points), map_.experts)
 
     share = map_.share if RULES[map_.rule].learns_share else None
@@ -155,7 +158,8 @@ def _to_other_half(
     individual: Float[np.ndarray, "p M d"],
     split: Bool[np.ndarray, "s M"],
 ) -> tuple[Float[np.ndarray, "p s2"], Float[np.ndarray, "p M"]]:
-    """NRMSE to where the other half's optimum is after all trials: of each half's optimum, and of each person's own."""
+    """NRMSE to the other half's optimum after all trials: of each half's optimum (p, 2 s), and of each participant's
+    own, as the median over splits (p, M); NaN without splits."""
     if not len(split):
         return np.zeros((len(tops), 0)), np.full(individual.shape[:2], np.nan)
     last = tops[-1, :, ::-1]  # of a half, the other half's
@@ -166,7 +170,8 @@ def _to_other_half(
 
 
 def _map_by_points(study: Study, share: Float[Array, ""], posteriors: Posterior) -> RuleMap:
-    """The map of these posteriors by the study's rule, or by bcm where the rule takes all answers at once."""
+    """Map of these posteriors by the study's method, or by its pointwise counterpart if it takes all responses at
+    once."""
     rule, rule_share = point_rule(study.rule, share)
     prior = jnp.asarray(study.gp.kernel.variance)
     return RuleMap(
@@ -175,7 +180,8 @@ def _map_by_points(study: Study, share: Float[Array, ""], posteriors: Posterior)
 
 
 def _counts(ends: Int[np.ndarray, " M"]) -> Int[np.ndarray, " p"]:
-    """Everybody's last trial, the moments, and trials evenly between them."""
+    """Sorted numbers of trials: each participant's last, 5, 15 and 25, and up to 25 evenly spaced ones. `ends`:
+    responses per participant."""
     longest = int(ends.max())
     even = np.linspace(1, longest, min(longest, _LONGEST)).round().astype(int)
     return np.unique([*ends[ends > 0], *even, *(n for n in _MOMENTS if n <= longest)])

@@ -1,8 +1,8 @@
-"""Where the best rendering lies as far as the answers tell: a region that holds it with 95 %.
+"""Credible region of the optimum: the set of points that contains the best stimulus with a probability of 95 %.
 
-Joint draws of the map's shared function say where it is largest; the points that are most often largest, until 95 % of
-the draws are among them, are the region. The points are spread evenly over the feasible set, its walls included. Where
-hyperparameters are learnt they are drawn too: taken as learnt, they leave the region too small.
+Joint draws of the map's shared function are maximised; points are added to the region in the order of how often they
+were the maximum, until it contains 95 % of the draws. The points are spread evenly over the feasible set, its walls
+included. Learnt hyperparameters are drawn too: fixed at their estimates, they would make the region too small.
 """
 
 from typing import Any, NamedTuple
@@ -32,23 +32,23 @@ _DRAWS = 16 * DRAWS  # fewer scatter over many points, and the region is too sma
 
 
 class Region(NamedTuple):
-    """Points of the unit cube, among even ones, one of which is the best with `PROBABILITY`."""
+    """The points of the unit cube, of a finite even set, that form the 95 % credible region of the optimum."""
 
     points: Float[np.ndarray, "k d"]
     others: Float[np.ndarray, "m d"]
-    """The points that are not in it."""
+    """The points outside the region."""
     volume: float
-    """Its share of the feasible set."""
+    """Fraction of the feasible set that the region takes up."""
     hills: tuple[Hill, ...] = ()
-    """By falling probability."""
+    """Modes of the map, in the order of falling probability."""
 
     @property
     def located(self) -> bool:
-        """Whether it is small enough to say where the best rendering is."""
+        """Whether the region is at most a quarter of the feasible set."""
         return self.volume <= _LOCATED
 
     def holds(self, x: Float[np.ndarray, " d"], kernel: Stationary) -> bool:
-        """Whether the nearest of all points, by the kernel's distance, is in the region."""
+        """Whether the point nearest to `x` (d,), by the kernel's distance, is in the region."""
         places = embedded(kernel, np.concatenate([self.points, self.others, x[None]]))
         away, count = np.sum((places[:-1] - places[-1]) ** 2, axis=1), len(self.points)
         near, far = np.min(away[:count], initial=np.inf), np.min(away[count:], initial=np.inf)
@@ -56,8 +56,10 @@ class Region(NamedTuple):
 
 
 def optimum_region(study: Study, map_: RuleMap, trials: Trials, seed: int = 0, count: int = POINTS) -> Region | None:
-    """The region, of `count` even points of the feasible set and a quarter as many on its walls; None for maps without
-    a joint posterior (those that are aggregated point by point). `trials`: everybody's, stacked, of which the map is.
+    """Credible region of the map's optimum; None for maps without a joint posterior (those aggregated point by point).
+
+    `trials`: the responses behind the map, stacked (M, ...). `count`: number of even points of the feasible set; a
+    quarter as many are added on its walls.
     """
     if map_.shared is None:
         return None
@@ -79,8 +81,8 @@ def optimum_region(study: Study, map_: RuleMap, trials: Trials, seed: int = 0, c
 
 
 def _distinct(points: Float[np.ndarray, "m d"]) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " m"]]:
-    """Where each of the points is for the first time, and which of these each point is. Levels and whole numbers have
-    few renderings, and walls have corners: copies would each be a hill, and share its draws."""
+    """Index of the first copy of each distinct point (k,), and for each point which of these it equals (m,). Without
+    this, copies (of levels, whole numbers and corners) would divide the draws of one point among several modes."""
     _, first, which = np.unique(points, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty_like(order)
@@ -89,7 +91,7 @@ def _distinct(points: Float[np.ndarray, "m d"]) -> tuple[Int[np.ndarray, " k"], 
 
 
 def region_content(study: Study, region: Region | None) -> dict[str, Any] | None:
-    """For result.json, in physical units."""
+    """The region as a dict for result.json, in physical units; None for no region."""
     if region is None:
         return None
     physical = np.asarray(study.space.to_physical(jnp.asarray(region.points)))
@@ -112,14 +114,15 @@ def region_content(study: Study, region: Region | None) -> dict[str, Any] | None
 
 
 def _extent(parameter: Parameter, values: Float[np.ndarray, " k"]) -> list[float | str]:
-    """Both ends of a parameter's values; of levels all that are among them."""
+    """Smallest and largest of a parameter's values; of levels the names of all that occur."""
     if parameter.levels:
         return [parameter.shown(value) for value in np.unique(values).tolist()]
     return [values.min().item(), values.max().item()]
 
 
 def region_sentences(region: Region | None) -> list[str]:
-    """A warning where these answers do not locate the optimum, and one where it may be on another hill."""
+    """Warnings: the optimum is not located (region above a quarter of the space), and it may be at another mode
+    (probability above 0.2). Empty for no region."""
     if region is None:
         return []
     sentences = []

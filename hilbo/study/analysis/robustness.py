@@ -1,10 +1,12 @@
-"""The paper's robustness check: do the optima stay where they are when the evidence chooses the hyperparameters?
+"""The paper's robustness check: do the optima move if the hyperparameters maximise the marginal likelihood?
 
-The population optimum and everybody's own are found twice, under the study's fixed hyperparameters and under learnt
-ones (shared by all, or each person's own), and compared in units of the search ranges (NRMSE). Besides, the derivative
-of the population optimum with respect to each hyperparameter says which of them it leans on. People are aggregated by
-the study's rule, point by point; the share of the hierarchical rule is learnt anew, and held for the derivative. Beside
-the shift stands what the choice of the people leaves open anyway: a bootstrap over people.
+The population optimum and the individual optima are computed twice, with the study's fixed hyperparameters and with
+learnt ones (shared by all, or per participant), and compared in units of the search ranges (NRMSE). In addition, the
+derivative of the population optimum with respect to each hyperparameter shows its influence. Participants are
+aggregated by the study's method, point by point; the shared variance fraction of the hierarchical method is estimated
+again, and kept fixed for the derivative. For comparison with the shift, a bootstrap gives the sampling variation over
+participants.
+
 Paper, section IV-3: less than 3 %.
 """
 
@@ -40,51 +42,54 @@ LIMIT = 0.03
 
 
 class Robustness(eqx.Module):
-    """Optima under fixed and under learnt hyperparameters, and how far apart they are."""
+    """Optima with fixed and with learnt hyperparameters, and the distances between them."""
 
     judged: Judged
-    """What was learnt, one model if `shared`, else stacked, one for each participant; and Laplace's error there."""
+    """Learnt hyperparameters, one model if `shared`, otherwise stacked per participant; and the error of the Laplace
+    approximation there."""
     fixed: Optimum
     optimised: Optimum
     fixed_individuals: Optimum
     optimised_individuals: Optimum
     posteriors: Posterior
-    """Of all participants, under the fixed hyperparameters,"""
+    """All participants' posteriors with the fixed hyperparameters."""
     optimised_posteriors: Posterior
-    """and under the learnt ones."""
+    """All participants' posteriors with the learnt hyperparameters."""
     nrmse: Float[Array, ""]
-    """Between the population optima."""
+    """NRMSE between the population optima."""
     individual_nrmse: Float[Array, " M"]
     resampled: Float[Array, " draws"] | None
-    """NRMSE of the population optimum of bootstrap resamples of the people to that of all, fixed hyperparameters; None
-    of one person, who says nothing of others."""
+    """NRMSE of the population optimum of each bootstrap resample to that of all participants, fixed hyperparameters;
+    None with fewer than two participants."""
     sensitivity: dict[str, Float[Array, "..."]]
     """d(population optimum, unit cube) / d(log theta, log noise, first threshold, log gaps) at the fixed values."""
     shared: bool = eqx.field(static=True)
     rule: str = eqx.field(static=True)
-    """By which people were aggregated, point by point: the study's, or bcm where that takes all answers at once."""
+    """Aggregation method, point by point: the study's, or its counterpart if that takes all responses at once."""
     shares: tuple[Float[Array, ""] | None, Float[Array, ""] | None]
-    """Of the hierarchical rule, under the fixed and under the learnt hyperparameters."""
+    """Shared variance fraction of the hierarchical method, with fixed and with learnt hyperparameters; otherwise
+    None."""
 
     @property
     def maximum(self) -> MaximumEvidence:
-        """The hyperparameters."""
+        """The learnt hyperparameters and their convergence diagnostics."""
         return self.judged.maximum
 
     def maps(self) -> tuple[partial, partial]:
-        """The population maps under the fixed and under the learnt hyperparameters: functions of points (m, d)."""
+        """The population maps with fixed and with learnt hyperparameters: functions of points (m, d) of the unit cube
+        that return mean and variance (m,)."""
         both = zip((self.posteriors, self.optimised_posteriors), self.shares, strict=True)
         fixed, learnt = (partial(predict_people, posteriors, rule=self.rule, share=share) for posteriors, share in both)
         return fixed, learnt
 
     @property
     def flagged(self) -> Bool[Array, ""]:
-        """Whether the population optimum moves by 3 % of the search ranges or more."""
+        """Whether the population optimum moves by 3 % of the search ranges or more, a scalar."""
         return self.nrmse >= LIMIT
 
     @property
     def flagged_individuals(self) -> Bool[Array, " M"]:
-        """The same for everybody's own optimum."""
+        """Mask of the participants whose optimum moves by 3 % of the search ranges or more."""
         return self.individual_nrmse >= LIMIT
 
 
@@ -97,10 +102,12 @@ def robustness(
     shared: bool = True,
     weak_priors: bool = True,
 ) -> Robustness:
-    """Repeat the paper's check for a cohort.
+    """Repeat the paper's robustness check for a cohort.
 
-    `shared`: one set of hyperparameters for all, else each participant's own. `weak_priors` keep the learnt values
-    finite where 25 ordinal answers do not (`maximum.runaway` says where even they ran away).
+    `learn`: hyperparameters to learn, of "theta", "noise" and "thresholds". `shared`: one set for all participants,
+    otherwise one for each. `weak_priors` keep the learnt values finite if 25 ordinal responses do not
+    (`maximum.runaway` marks those that diverged even so). Raises InputError for another hyperparameter, and for a study
+    whose method learns them itself.
     """
     _check(study, learn)
     candidates = search_points(study.space, seed)
@@ -136,7 +143,7 @@ def robustness(
 
 
 def _check(study: Study, learn: Sequence[str]) -> None:
-    """Raises InputError for a study, or hyperparameters, that cannot be compared."""
+    """Raise InputError for hyperparameters that cannot be learnt here, and for a study without fixed ones."""
     if "variance" in learn:
         raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
     if unknown := [name for name in learn if name not in _LEARNABLE]:
@@ -149,8 +156,8 @@ def _check(study: Study, learn: Sequence[str]) -> None:
 
 
 def _refitted(study: Study, cohort: Cohort, gp: OrdinalGP, shared: bool) -> tuple[Study, Posterior]:
-    """The study with learnt hyperparameters where everybody shares them, and the posteriors under these or each
-    person's own."""
+    """Refit with learnt hyperparameters `gp`; returns the study with them (unchanged unless `shared`), and the
+    posteriors."""
     if not shared:
         return study, fit_cohort(study, cohort, gp)
     learnt = eqx.tree_at(lambda s: s.gp, study, gp)
@@ -166,8 +173,8 @@ def _resampled(
     share: Float[Array, ""] | None,
     seed: int,
 ) -> Float[Array, " draws"] | None:
-    """How far the optimum of resampled people is from x, sought among x and some of the candidates; None of one person,
-    of whom every resample is the same."""
+    """Bootstrap over participants: NRMSE of each resample's optimum, among x and 1000 candidates, to x. None for fewer
+    than two participants with responses."""
     if not can_resample(posteriors):
         return None
     points = jnp.concatenate([x[None, :], candidates[:_POINTS]])
@@ -176,7 +183,7 @@ def _resampled(
 
 
 def _share(study: Study, cohort: Cohort) -> Float[Array, ""] | None:
-    """What people have in common, where the study's rule asks for it."""
+    """Shared variance fraction estimated from the cohort, if the study's method uses it; otherwise None."""
     return share_of(study.gp, cohort.trials, study.inference).mean if RULES[study.rule].learns_share else None
 
 
@@ -189,7 +196,7 @@ def _sensitivity(
     rule: str,
     share: Float[Array, ""] | None,
 ) -> dict[str, Float[Array, "..."]]:
-    """Derivatives of the population optimum x, as `Robustness.sensitivity`."""
+    """Derivatives of the population optimum x by each hyperparameter in `learn`; see `Robustness.sensitivity`."""
 
     def refit(gp):
         return jax.vmap(lambda t: fit(gp, t, inference=study.inference, throw=False))(trials)

@@ -1,10 +1,11 @@
-"""Every aggregation rule on one cohort, as data: how it predicts people who are left out, and what its map says.
+"""All aggregation methods on one cohort: cross-validated predictions of left-out participants, and properties of each
+map.
 
-For each rule: the predictive density, calibration and reliability, answer by answer (`leave_one_out`); its
-optimum; how the optimum is spread, by joint draws of the map (of bcm, hierarchical and pooled, whose joint posterior is
-known) and by a bootstrap over people (of the rules that aggregate people point by point); what each person moves; how
-it agrees with one model of all answers; and how much of the space the answers cover, the map's standard deviation over
-what it is without answers. And, once, how people differ, with a recommendation in words.
+For each method: predictive density, calibration and reliability per response (`leave_one_out`); its optimum; the spread
+of the optimum by joint draws of the map (bcm, hierarchical and pooled, whose joint posterior is known) and by a
+bootstrap over participants (of methods that aggregate point by point); the influence of each participant; its agreement
+with one model of all responses; and the proportion of the space where the responses reduce the map's standard
+deviation. And, once, the differences between participants, with a recommendation in words.
 """
 
 import dataclasses
@@ -45,20 +46,23 @@ from hilbo.study.estimate.optimum import map_optimum
 __all__ = ["FEWEST", "KNOWN", "compare", "differences", "recommendation"]
 
 FEWEST = 3
-"""People with answers: each is left out in turn, and two must be left. parts.html says three."""
+"""Smallest number of participants with responses: each is left out in turn, and two must remain. parts.html has the
+number too."""
 KNOWN = 0.8
-"""Where the map's standard deviation is below so much of what it is without answers, these cover the space."""
+"""Ratio of the map's standard deviation to that without responses, below which a point counts as covered by
+responses."""
 
 _POINTS = 400  # at which joint draws and bootstrap seek the optimum
 _DRAWS = 2000
 
 
 def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool = True) -> dict[str, Any]:
-    """All rules side by side; by the study's hyperparameters, and the share that everybody's answers say, but a recipe
-    (the study's, else the recommended one) by what it learns in each fold, if it `learns`. What a rule cannot do stands
-    there as its reason.
+    """Compare all methods with given hyperparameters, and, if `learns`, one that learns them in each fold (the study's,
+    otherwise the recommended one).
 
-    Raises InputError for fewer than three people with answers: two must be left when one is left out.
+    Returns a dict for comparison.json: "share", "people", "answers", "recommendation", and "rules": method -> its
+    figures, or {"refused": reason}. Participants without responses are left out. Raises InputError for fewer than three
+    others: two must remain when one is left out.
     """
     answered = np.flatnonzero(aggregate.cohort.counts() > 0)
     if len(answered) < FEWEST:
@@ -96,20 +100,21 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
 
 
 class _Ground(NamedTuple):
-    """What all rules are compared on: the people with answers, and the points at which maps are."""
+    """The data shared by all methods: participants with responses, and the points at which maps are compared."""
 
     cohort: Cohort
     posteriors: Posterior
     candidates: Float[Array, "m d"]
-    """Where optima are searched."""
+    """Points from which optima are searched."""
     x: Float[Array, "p d"]
-    """Where maps are compared, drawn and resampled."""
+    """Points at which maps are compared, drawn and resampled."""
     pooled: tuple[Float[Array, " p"], Float[Array, " d"]] | None
-    """One model of all answers: its mean at `x`, and its optimum; None where it was refused."""
+    """Of one model of all responses: mean at `x`, and optimum; None if it was refused."""
     seed: int
 
 
 def _ground(study: Study, cohort: Cohort, posteriors: Posterior, pooled: RuleMap | str, seed: int) -> _Ground:
+    """The shared data: candidates, 400 points, and mean and optimum of the pooled map (None if it was refused)."""
     candidates = search_points(study.space, seed)
     x = candidates[: min(_POINTS, len(candidates))]
     one = None if isinstance(pooled, str) else (pooled.predict(x)[0], map_optimum(study, pooled, candidates).x)
@@ -117,13 +122,15 @@ def _ground(study: Study, cohort: Cohort, posteriors: Posterior, pooled: RuleMap
 
 
 def _that_learns(study: Study, recipe: str, cohort: Cohort, everybody: bool) -> Study:
-    """The study with what a recipe learns of these people, which is there already if they are everybody."""
+    """The study with hyperparameters learnt from this cohort by `recipe`; what was learnt before is reused only if the
+    cohort is complete (`everybody`)."""
     learns = study if study.rule == recipe else that_learns(study, recipe)
     return resolved(learns if everybody else dataclasses.replace(learns, learnt=None), cohort)
 
 
 def _learnt_entry(learns: Study, ground: _Ground) -> tuple[LeftOut, dict[str, Any]]:
-    """A recipe, whose hyperparameters are learnt again without each person; beside it, with those of all answers."""
+    """Predictions and figures (see `_entry`) of a method whose hyperparameters are learnt again in each fold; with the
+    mean cost if they are learnt once from all."""
     assert learns.learnt is not None
     trials = ground.cohort.trials
     left, folds = leave_one_out_learnt(learns.learnt, trials, learns.stated)
@@ -135,7 +142,7 @@ def _learnt_entry(learns: Study, ground: _Ground) -> tuple[LeftOut, dict[str, An
 
 
 def _map(study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: Share) -> RuleMap | str:
-    """A rule's map, or the sentence that says why there is none."""
+    """Map by a method, or the sentence with the reason why there is none."""
     try:
         return rule_map(
             study.gp, cohort.trials, rule, posteriors=posteriors, share=share.mean, inference=study.inference
@@ -145,7 +152,8 @@ def _map(study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: 
 
 
 def _entry(study: Study, ground: _Ground, map_: RuleMap, left: LeftOut, folds: list[RuleMap]) -> dict[str, Any]:
-    """How a rule predicts people who are `left` out, and what its map says; `folds`: its maps without each person."""
+    """Figures of one method, as a dict: calibration of the `left`-out predictions, optimum, influence and so on.
+    `folds`: its map without each participant."""
     best = map_optimum(study, map_, ground.candidates)
     mean, variance = map_.predict(ground.x)
     moved = influence(map_, folds, ground.x)
@@ -169,12 +177,12 @@ def _entry(study: Study, ground: _Ground, map_: RuleMap, left: LeftOut, folds: l
 
 
 def _agreement(mean: Float[Array, " p"], other: Float[Array, " p"]) -> float:
-    """Correlation over the points: the scales of two maps need not be the same."""
+    """Correlation of two maps over the points; independent of their scales."""
     return float(jnp.corrcoef(mean, other)[0, 1])
 
 
 def _by_draws(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[float]] | None:
-    """Quantiles of where joint draws of the map are largest; None where the map has no joint posterior."""
+    """5, 50 and 95 % quantiles of the maximum of joint draws of the map; None if the map has no joint posterior."""
     x = ground.x
     if map_.method == "exact" and map_.shared is not None:
         joint = posterior_map(map_.shared, x)
@@ -186,7 +194,8 @@ def _by_draws(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[fl
 
 
 def _by_bootstrap(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[float]] | None:
-    """Quantiles of where the map of people drawn with replacement is largest; None for rules that take all at once."""
+    """5, 50 and 95 % quantiles of the map's maximum under resampling of participants; None for methods that do not
+    aggregate point by point."""
     if not RULES[map_.rule].by_points:
         return None
     share = map_.share if RULES[map_.rule].learns_share else None
@@ -196,7 +205,8 @@ def _by_bootstrap(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, lis
 
 
 def _quantiles(study: Study, x: Float[Array, "p d"], weight: Float[np.ndarray, " p"]) -> dict[str, list[float]]:
-    """5, 50 and 95 % of each parameter, in its unit, over weighted points; of levels that of the largest weight."""
+    """Parameter -> its 5, 50 and 95 % quantiles over weighted points, in its unit; of levels a list with the most
+    probable one."""
     physical = np.asarray(study.space.to_physical(np.asarray(x)))
     quantiles = {}
     for i, p in enumerate(study.space.parameters):
@@ -211,17 +221,19 @@ def _quantiles(study: Study, x: Float[Array, "p d"], weight: Float[np.ndarray, "
 
 
 def _parameters(study: Study, x: Float[Array, " d"]) -> dict[str, Any]:
+    """A point of the unit cube as parameter -> value in physical units, levels by name."""
     values = np.asarray(study.space.to_physical(np.asarray(x))).tolist()
     return {p.name: p.shown(v) if p.levels else v for p, v in zip(study.space.parameters, values, strict=True)}
 
 
 def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Share, people: int) -> str:
-    """How people differ and which rule predicts best, in a few sentences; `left`: what each rule predicted of
-    everybody's answers. A rule is recommended only if the others predict worse by more than two errors, and if it does
-    not take people to be alike where these differ.
+    """Sentences on the differences between participants and on the method that predicts best. `left`: method -> its
+    cross-validated predictions; `rules`: as in `compare`; `people`: number of participants.
 
-    Costs are compared answer by answer, with errors by person: people are predicted well or badly by all rules alike,
-    which the error of one rule's mean cost would take for doubt.
+    A method is recommended only if all others predict worse by more than two standard errors, and unless it assumes
+    identical participants where these differ. Costs are compared response by response, with errors clustered by
+    participant: participants are easy or hard to predict for all methods alike, so that the error of one method's mean
+    cost would exaggerate the uncertainty.
     """
     scored = {rule: scores for rule, scores in rules.items() if "negative_log_density" in scores}
     best = min(scored, key=lambda rule: scored[rule]["negative_log_density"])
@@ -250,12 +262,12 @@ def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Sh
 
 
 def differences(left: Mapping[str, LeftOut]) -> dict[str, tuple[float, float]]:
-    """How much more each rule's mean cost is than the best rule's (nats an answer), with the standard error of that
-    difference, paired by answer and clustered by person; 0 and 0 for the best."""
+    """Method -> difference of its mean cost from the lowest one (nats per response), and the standard error of that
+    difference, paired by response and clustered by participant; (0, 0) for the best method."""
     best = min(left, key=lambda rule: left[rule].cost.mean())
     return {rule: clustered(each.cost - left[best].cost, each.person) for rule, each in left.items()}
 
 
 def _near(difference: float, error: float) -> bool:
-    """Whether a difference is within two of its standard errors."""
+    """Whether a difference is at most two of its standard errors; True if the error is not finite."""
     return not math.isfinite(error) or difference <= 2 * error

@@ -1,18 +1,17 @@
-"""Reading a population map: best, mid and worst renderings, and how far a parameter may move before "close" is lost.
+"""Reading a population map: best, mid and worst stimuli, and the tolerance interval of each parameter.
 
-A map is anything that predicts, `predict(x) -> mean, variance` of the latent score at points (m, d) of the unit cube.
-
-*Best* is the feasible maximum of the mean. *Worst* is the deepest local minimum of the mean in the feasible set at
-which the map knows something: sd <= `known` times what it is where nobody answered. *Mid* is the candidate whose mean
-is nearest to the middle of the two, among those at least `apart` from both, and equally known. All three follow from
-the map alone (paper, section VI-C).
+A map is any function `predict(x) -> mean, variance` of the latent score at points (m, d) of the unit cube. *Best* is
+the feasible maximum of the mean. *Worst* is the deepest local minimum of the mean in the feasible set at which the map
+is informed by responses: sd <= `known` times that without responses. *Mid* is the candidate whose mean is nearest to
+the middle of the two, among those at least `apart` from both, and equally known. All three follow from the map alone
+(paper, section VI-C).
 
 The *tolerance interval* of a parameter is the connected feasible interval through the optimum on which the highest
-answer is the most probable one of what `predict` is about, a new person's function (paper, section VII-C). Along any
-parameter but K1 the slice stays passive: K1 is held where it is passive, and on the passive boundary where it is not,
-the closest passive point; along K1 the interval ends, one-sided, where the boundary cuts it. Each end says what it is:
-another answer, the range, or what the next rendering is beyond: a constraint of the study, the passive boundary, or the
-range of effective damping.
+response is the most probable one under `predict`, a new participant's function (paper, section VII-C). Along any
+parameter but K1 the slice stays passive: K1 is kept where it is passive, and reduced to the passive boundary where it
+is not; along K1 the interval ends, one-sided, where the boundary cuts it. Each end has a reason: another response, the
+range, or the limit that the next value violates: a constraint of the study, the passive boundary, or the range of
+effective damping.
 """
 
 from collections.abc import Callable
@@ -45,7 +44,7 @@ _HALVINGS = 40
 
 
 class Sets(eqx.Module):
-    """Three renderings, best, mid and worst: points (3, d) of the unit cube, and the map there."""
+    """Best, mid and worst stimulus: points (3, d) of the unit cube, and mean and sd of the map there."""
 
     x: Float[Array, "3 d"]
     mean: Float[Array, "3"]
@@ -71,12 +70,12 @@ def best_mid_worst(
     apart: float = 0.2,
     prior: ArrayLike | None = None,
 ) -> Sets:
-    """The three renderings of a validation session; see the module. Deterministic: the map and the candidates decide.
+    """Best, mid and worst stimulus of a validation session, as the module defines them. Deterministic.
 
-    **Arguments:** `candidates`, feasible points (`search_points`); `known`, the largest sd of worst and mid in
-    units of the prior's; `apart`, the least distance of mid from both, in the unit cube; `prior`, the map's variance
-    where nobody answered (`RuleMap.map_prior`), a scalar or (m,), one person's if it is not given. Raises InputError
-    if the map knows nothing well enough, or has nothing in between.
+    **Arguments:** `candidates`: feasible points (`search_points`); `known`: largest sd of worst and mid, in units of
+    the prior's; `apart`: smallest distance of mid from both, in the unit cube; `prior`: the map's variance without
+    responses (`RuleMap.map_prior`), a scalar or (m,), by default one participant's. Raises InputError if no minimum is
+    known well enough, or no candidate qualifies as mid.
     """
     candidates = jnp.asarray(candidates)
     mean, sd = _mean_and_sd(predict, candidates)
@@ -109,15 +108,15 @@ def best_mid_worst(
 
 
 def dominant(study: Study, predict: Predict, x: Float[Array, "m d"]) -> Bool[Array, " m"]:
-    """Whether the highest answer is the most probable one at points (m, d) (paper, section VII-C)."""
+    """Whether the highest response is the most probable one at points (m, d) (paper, section VII-C)."""
     return _lead(study, predict, x) > 0
 
 
 def slice_through(
     study: Study, x: Float[Array, " d"], parameter: str, values: Float[Array, " m"]
 ) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:
-    """Points (m, d): x with its coordinate of `parameter` at `values` (unit scale), and K1 lowered to the passive
-    boundary where it must be; and whether they are feasible."""
+    """Points (m, d): copies of x with the coordinate of `parameter` at `values` (unit scale), and whether each is
+    feasible (m,). Where needed, K1 is lowered to the passive boundary, except in slices along K1."""
     space = study.space
     index = space.names.index(parameter)
     points = jnp.broadcast_to(x, (values.shape[0], x.shape[0])).at[:, index].set(values)
@@ -129,7 +128,8 @@ def slice_through(
 
 
 def tolerance(study: Study, predict: Predict, x: Float[Array, " d"], parameter: str) -> Tolerance | None:
-    """The tolerance interval of a parameter through the optimum `x` (d,); None if another answer is likelier there."""
+    """Tolerance interval of a parameter through the optimum `x` (d,); None if the highest response is not the most
+    probable one there."""
     index = study.space.names.index(parameter)
     here, searched = float(x[index]), study.space.parameters[index]
     grid = searched.axis(_GRID) if searched.discrete else np.unique(np.append(np.linspace(0.0, 1.0, _GRID), here))
@@ -156,7 +156,7 @@ def tolerance(study: Study, predict: Predict, x: Float[Array, " d"], parameter: 
 
 
 def _end(study: Study, x: Float[Array, " d"], parameter: str, outer: float) -> End:
-    """What ends an interval, by the first value that is beyond it."""
+    """Reason of an interval's end: the limit that its first outside value `outer` violates, or "other answer"."""
     (point,), _ = slice_through(study, x, parameter, jnp.asarray([outer], x.dtype))
     return study.space.broken(point) or "other answer"
 
@@ -164,7 +164,8 @@ def _end(study: Study, x: Float[Array, " d"], parameter: str, outer: float) -> E
 def _tolerated(
     study: Study, predict: Predict, x: Float[Array, " d"], parameter: str, values: Float[Array, " m"]
 ) -> Bool[np.ndarray, " m"]:
-    """Of values of a parameter: where the highest answer is the likeliest, and feasible."""
+    """Mask of the parameter values (unit scale) at which the slice is feasible and the highest response is the most
+    probable."""
     points, feasible = slice_through(study, x, parameter, values)
     return np.asarray(feasible & dominant(study, predict, points))
 
@@ -172,7 +173,8 @@ def _tolerated(
 def _bisect(
     study: Study, predict: Predict, x: Float[Array, " d"], parameter: str, inner: float, outer: float
 ) -> tuple[float, float]:
-    """The end of an interval between a value inside it and one outside: the last that is inside, and one beyond."""
+    """Narrow down an interval's end between a value inside and one outside, by 40 bisections; returns both, inside
+    first."""
     for _ in range(_HALVINGS):
         middle = (inner + outer) / 2
         if _tolerated(study, predict, x, parameter, jnp.asarray([middle], x.dtype))[0]:
@@ -184,13 +186,14 @@ def _bisect(
 
 @program
 def _lead(study: Study, predict: Predict, x: Float[Array, "m d"]) -> Float[Array, " m"]:
-    """Probability of the highest answer less that of the likeliest other one."""
+    """Probability of the highest response minus that of the most probable other one. (m,)."""
     p = jax.vmap(study.gp.likelihood.class_probabilities)(*predict(x))
     return p[:, -1] - jnp.max(p[:, :-1], axis=1)
 
 
 @program
 def _mean_and_sd(predict: Predict, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Mean and standard deviation of the map at the points."""
     mean, variance = predict(x)
     return mean, jnp.sqrt(variance)
 
@@ -199,13 +202,15 @@ def _mean_and_sd(predict: Predict, x: Float[Array, "m d"]) -> tuple[Float[Array,
 def _highest(
     study: Study, predict: Predict, candidates: Float[Array, "m d"], mean: Float[Array, " m"]
 ) -> Float[Array, " d"]:
+    """Feasible maximum of the map's mean, searched from the three highest candidates."""
     return _maximum(study, lambda x: predict(x[None, :])[0][0], candidates, mean, starts=3).x
 
 
 def _minima(
     study: Study, predict: Predict, candidates: Float[Array, "m d"], depth: Float[Array, " m"]
 ) -> Float[Array, "s d"]:
-    """Local minima (s, d) of the mean, downhill from the lowest candidates of different places."""
+    """Local minima (s, d) of the mean, searched downhill from up to 24 separate candidates of small `depth`, inf
+    excluding a candidate. Some may repeat; none if all are excluded."""
     points, left = np.asarray(candidates), np.asarray(depth).copy()
     rows = []
     while len(rows) < _STARTS and np.isfinite(left).any():
@@ -220,7 +225,7 @@ def _minima(
 
 @program
 def _downhill(study: Study, predict: Predict, starts: Float[Array, "s d"]) -> Float[Array, "s d"]:
-    """The local minimum of the mean below each start."""
+    """The local minimum of the mean below each start, (s, d)."""
 
     def one(x):
         return _maximum(study, lambda x: -predict(x[None, :])[0][0], x[None, :], jnp.zeros(1, x.dtype), 1).x
@@ -235,7 +240,8 @@ def _maximum(
     values: Float[Array, " m"],
     starts: int,
 ) -> Choice:
-    """The maximum of a function of one point, from those of the candidates where it is highest."""
+    """Feasible maximum of `height`, a function of one point, searched from the `starts` candidates with the largest
+    `values`."""
     space = study.space
     return acquisition.maximise(
         values,

@@ -1,10 +1,10 @@
-"""Tolerance intervals with their uncertainty: how far a parameter may move, had other people of this kind been asked.
+"""Tolerance intervals with their sampling uncertainty, by a bootstrap over participants.
 
-`tolerance.tolerance` reads the interval from a population map. Here people are resampled (a bootstrap), the map is
-aggregated anew from the same posteriors, and the interval through the same optimum is read off a grid; percentiles of
-its ends over these draws are what the choice of participants leaves open. A draw in which the highest answer is not the
-likeliest at the optimum has no interval, and counts as such. Nothing is refitted: aggregation is a sum over people.
-One person says nothing of others, of whom all draws are the same: there the percentiles are not known.
+`tolerance.tolerance` reads the interval from a population map. Here participants are resampled, the map is aggregated
+again from the same posteriors, and the interval through the same optimum is read off a grid; percentiles of its ends
+over these draws describe the variation due to the choice of participants. A draw in which the highest response is not
+the most probable one at the optimum has no interval, and is counted. Nothing is refitted. With one participant all
+draws are the same, so that the percentiles are not known.
 """
 
 import math
@@ -35,7 +35,7 @@ class Ends(eqx.Module):
     low: tuple[float, float]
     high: tuple[float, float]
     lost: float
-    """Share of draws in which the highest answer is not the likeliest at the optimum."""
+    """Fraction of draws in which the highest response is not the most probable one at the optimum."""
 
 
 def tolerance_ends(
@@ -49,10 +49,11 @@ def tolerance_ends(
     share: ArrayLike | None = None,
     draws: int = _DRAWS,
 ) -> Ends | None:
-    """Bootstrap over people of the tolerance interval of a parameter through `x` (d,); None if no draw has one. With
-    fewer than two people with answers every number is NaN.
+    """Bootstrap over participants of the tolerance interval of a parameter through `x` (d,); None if no draw has an
+    interval. With fewer than two participants with responses every number is NaN.
 
-    `share` is the hierarchical rule's.
+    `rule`: aggregation method that works point by point; `share`: shared variance fraction of the hierarchical one,
+    otherwise None.
     """
     if not can_resample(posteriors):
         return Ends((math.nan, math.nan), (math.nan, math.nan), math.nan)
@@ -80,7 +81,8 @@ def tolerance_ends(
 def _predictions(
     posteriors: Posterior, x: Float[Array, "m d"]
 ) -> tuple[Float[Array, "M m"], Float[Array, "M m"], Float[Array, " m"]]:
-    """Posterior mean and variance reduction (prior minus posterior) of each person, and prior variance, at points."""
+    """Posterior mean and variance reduction (prior - posterior) of each participant, (M, m), and prior variance (m,),
+    at points."""
     means, explained = jax.lax.map(lambda p: p.predict_explained(x), posteriors)
     kernel = jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel
     return means, explained, jax.vmap(kernel.diagonal)(x)
@@ -96,7 +98,8 @@ def _dominant_in_draws(
     rule: str,
     share: ArrayLike | None,
 ) -> Bool[Array, "draws m"]:
-    """Whether the highest answer is the likeliest one, (draws, m)."""
+    """Whether the highest response is the most probable one of a new participant, (draws, m); `rows`: participants of
+    each resample."""
 
     def one(chosen):
         mean, variance = aggregate(rule, means[chosen], explained[chosen], prior, share=share)
@@ -108,7 +111,7 @@ def _dominant_in_draws(
 
 
 def _ends(inside: Bool[np.ndarray, " m"], middle: int) -> tuple[int, int]:
-    """First and last place of the connected run through `middle`."""
+    """First and last index of the run of True values through `middle`."""
     outside = np.flatnonzero(~inside)
     below, above = outside[outside < middle], outside[outside > middle]
     first = int(below[-1]) + 1 if len(below) else 0

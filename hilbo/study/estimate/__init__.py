@@ -1,4 +1,4 @@
-"""From a cohort to its population map and the optima of it, by the study's rule.
+"""Estimation: from a cohort to its population map by the study's aggregation method, and the optima of the map.
 
-Numbers only: no sentence of a page and no file.
+Computes and describes estimates; writes no files.
 """

@@ -1,13 +1,13 @@
-"""A cohort's posteriors, its population map by the study's rule, and the optima of both, as one record.
+"""A cohort's posteriors, its population map by the study's aggregation method, and the optima of both, as one record.
 
     table     = read_trials("trials.csv", study)
     cohort    = cohort_of(table, study)
     aggregate = aggregate_cohort(study, cohort)
 
 Participants are fitted in compiled batches over trials padded to one capacity. The population map is a committee
-machine over their posteriors (`hilbo.bcm`), or what the study's rule says (`hilbo.population.maps`). Cohorts of any
-size go this way, on all devices of JAX's current mesh (`hilbo.numerics.sharding`): above `MANY` participants batches
-are of that many, and results that cost another fit of everybody are left out.
+machine over their posteriors (`hilbo.bcm`), or that of another method (`hilbo.population.maps`). Cohorts of any size
+are computed in this way, on all devices of JAX's current mesh (`hilbo.numerics.sharding`): above `MANY` participants in
+batches of that many, and without results that need another fit of every participant.
 """
 
 import contextlib
@@ -52,7 +52,7 @@ __all__ = [
 ]
 
 MANY = 1000
-"""Participants of a batch; of a larger cohort, what costs another fit of everybody is left out."""
+"""Participants per batch; for a larger cohort, results that need another fit of every participant are left out."""
 _LARGEST_POOL = 3000  # answers of the pooled alternative: its fit is cubic in their number
 
 
@@ -62,15 +62,16 @@ _Result = TypeVar("_Result", bound=PyTree)
 First = Callable[[Optimum, RuleMap], None]
 
 SayCount = Callable[[str, int, int], None]
-"""What was done, for how many participants so far, of how many."""
+"""Progress report: description, number of participants done, number of all."""
 
 
 def _silent(words: str, done: int, people: int) -> None:
+    """Ignore a progress report."""
     del words, done, people
 
 
 class Surface(eqx.Module):
-    """A population map as a function of points."""
+    """A population map as a callable function of points."""
 
     map: RuleMap
 
@@ -80,91 +81,95 @@ class Surface(eqx.Module):
 
 
 class Aggregate(eqx.Module):
-    """A study's posteriors, its population optimum by the study's rule, and what stands beside it."""
+    """A study's posteriors, its population optimum by the study's method, and alternatives to compare with."""
 
     cohort: Cohort
     posteriors: Posterior
     optimum: Optimum
     own: Optimum | None
-    """Everybody's own optimum, stacked; None if it was not sought."""
+    """Individual optima, stacked; None if they were not computed."""
     alternatives: dict[str, Optimum]
-    """Optimum of the plain average of the latent functions, of one GP on all answers (if not too many), by the
-    hierarchical rule and by bcm where the study's rule is another, and of the population map by another inference:
-    "ep", or "laplace" where the study itself says "ep"."""
+    """Method or inference -> optimum: of the plain average of the latent functions, of one GP on all responses (if not
+    too many), of the hierarchical method and bcm unless the study's own, and of the study's method with another
+    inference ("ep", or "laplace" if the study's own is "ep")."""
     map: RuleMap
-    """The population map by the study's rule."""
+    """The population map by the study's method."""
     maps: dict[str, RuleMap]
-    """The maps by all rules that were asked for, the study's among them, and that by the other inference."""
+    """Maps of all requested methods, the study's included, and that with the other inference."""
     share: Share | None
-    """What the answers say of how people differ; None if it was not asked, or fewer than two people answered."""
+    """Estimated shared variance fraction; None if it was not needed, or with fewer than two participants with
+    responses."""
 
     def __repr__(self) -> str:
+        """One line with cohort, map and optimum; the field structure while JAX traces."""
         if not has_values(self.optimum.x):
             return eqx.tree_pformat(self)
         return f"Aggregate({self.cohort!r}; {self.map!r}; {self.optimum!r})"
 
     @property
     def likelihood(self) -> OrdinalProbit:
-        """The likelihood that the posteriors were fitted by: the study's, or what its rule learnt."""
+        """The likelihood with which the posteriors were fitted: the study's, or the learnt one."""
         return jax.tree.map(lambda leaf: leaf[0], self.posteriors.gp).likelihood
 
     @property
     def hierarchical(self) -> RuleMap | None:
-        """The map by the hierarchical rule, beside which the study's is judged."""
+        """The map by the method "hierarchical"; None if it was not computed."""
         return self.maps.get("hierarchical")
 
     @property
     def certificates(self) -> dict[str, np.ndarray]:
-        """Everybody's certificate, (M,) for each of its figures."""
+        """Convergence diagnostics of all participants' fits: name -> (M,)."""
         certificate = self.posteriors.certificate
         return {name: np.asarray(getattr(certificate, name)) for name in certificate.__dataclass_fields__}
 
     @property
     def individuals(self) -> Optimum:
-        """Everybody's own optimum, stacked. Raises `InputError` if it was not sought."""
+        """Optimum of each participant, stacked (M). Raises `InputError` if they were not computed."""
         if self.own is None:
             raise InputError("Aggregate: everybody's own optimum was not sought; aggregate with individuals=True.")
         return self.own
 
     @property
     def asked_variance(self) -> Float[Array, ""] | None:
-        """Largest variance of the map at a point that somebody answered, a scalar; as `asked_variance`."""
+        """Largest variance of the map at a tested stimulus, a scalar; None if not known, as in the function
+        `asked_variance`."""
         return asked_variance(self.map, self.cohort)
 
     @property
     def surface(self) -> Surface:
-        """The population map as a function, for programs too: the ids of the participants are no part of it."""
+        """The population map as a function, which may be passed to compiled programs: it does not hold the
+        participants' ids."""
         return Surface(self.map)
 
     def class_probabilities(self, likelihood: OrdinalProbit, x: Float[ArrayLike, "m d"]) -> Float[Array, "m C"]:
-        """Probabilities (m, C) of a new person's answers at points of the unit cube."""
+        """Probabilities (m, C) of a new participant's responses at points of the unit cube."""
         return class_probabilities(likelihood, *self.newcomer(x), self.map.widths)
 
     def newcomer(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of a new person's function at points of the unit cube. By the hierarchical rules it
-        differs from the map, which is the function that people share."""
+        """Mean and variance (m,) of a new participant's latent function at points of the unit cube. By hierarchical
+        methods the variance exceeds that of the map, which is the function that participants share."""
         mean, variance = self.surface(x)
         return mean, variance + self.map.apart
 
     @property
     def mean_of_optima(self) -> Float[Array, " d"]:
-        """Plain average of the individuals' optima in the unit cube, of levels the commonest: what the paper compares
-        the map with. (d,)."""
+        """Mean (d,) of the individual optima in the unit cube, for levels the most frequent one; the paper compares the
+        map with it. Raises `InputError` if they were not computed."""
         return to_device(middle_of(self.posteriors.gp.kernel.levels, np.asarray(self.individuals.x)))
 
 
 def fit_cohort(
     study: Study, cohort: Cohort, gps: OrdinalGP | None = None, inference: Inference | None = None
 ) -> Posterior:
-    """Everybody's posterior, stacked; with the study's model, or with `gps`, one stacked model each; by the study's
-    inference, or by another."""
+    """Posterior of each participant, stacked (M). `gps`: one stacked model per participant instead of the study's;
+    `inference`: instead of the study's. Fits that fail do not raise; see their certificates."""
     return _fitted(study, cohort, gps, inference, _silent)
 
 
 def _fitted(
     study: Study, cohort: Cohort, gps: OrdinalGP | None, inference: Inference | None, say: SayCount
 ) -> Posterior:
-    """As `fit_cohort`, in batches."""
+    """As `fit_cohort`, in batches; `say` is called after each batch if there are several."""
     by = study.inference if inference is None else inference
     if gps is None:
         return _in_batches(lambda trials: _fit_cohort(study.gp, trials, by), cohort.trials, "participants fitted", say)
@@ -175,6 +180,8 @@ def _fitted(
 # Programs take what they use: two studies that differ in their words share them.
 @program
 def _fit_cohort(gp: OrdinalGP, trials: Trials, inference: Inference) -> Posterior:
+    """Compiled fit of all participants with one model."""
+
     def each(trials, gp):
         return jax.vmap(lambda t: fit(gp, t, inference=inference, throw=False))(trials)
 
@@ -183,12 +190,16 @@ def _fit_cohort(gp: OrdinalGP, trials: Trials, inference: Inference) -> Posterio
 
 @program
 def _fit_own(gps: OrdinalGP, trials: Trials, inference: Inference) -> Posterior:
+    """Compiled fit of participants with one stacked model each."""
     return of_each_person(jax.vmap(lambda both: fit(*both, inference=inference, throw=False)), (gps, trials))
 
 
 def _in_batches(function: Callable[[_People], _Result], people: _People, words: str, say: SayCount) -> _Result:
-    """A function of stacked people for at most `MANY` at once, to bound the memory for intermediate values: one
-    compiled program, whose last batch is filled up with copies of the last person."""
+    """Apply a function to stacked participants in batches of at most `MANY`, to bound memory, and join the results.
+
+    All batches have one size and so one compiled program: the last is padded with copies of the last participant, which
+    are removed again. `say` is called with `words` after each batch if there are several.
+    """
     count = jax.tree.leaves(people)[0].shape[0]
     if count <= MANY:
         return function(people)
@@ -202,7 +213,7 @@ def _in_batches(function: Callable[[_People], _Result], people: _People, words: 
 
 
 def other_inference(study: Study) -> Inference:
-    """The inference beside which a study's results are shown."""
+    """The inference with which a study's results are compared: "ep", or "laplace" if the study's own is "ep"."""
     return "laplace" if study.inference == "ep" else "ep"
 
 
@@ -216,13 +227,13 @@ def aggregate_cohort(
     individuals: bool = True,
     say: SayCount = _silent,
 ) -> Aggregate:
-    """Fit everybody, aggregate, and find the optima; the study's `rule` decides the population optimum.
+    """Fit all participants, aggregate, and find the optima; the study's `rule` determines the population optimum.
 
-    `seed` decides the candidates that the optima are searched from. Failed certificates are left to the caller, who
-    finds them in `posteriors.certificate`. A rule that learns the hyperparameters does so first, if they are not
-    there. `first` is told the optimum and its map as soon as they are known. Without `individuals` nobody's own optimum
-    is sought, and without `alternatives` none by another rule. `say` is told the progress above `MANY` participants.
-    Raises `InputError` for a table in place of a cohort.
+    `seed` determines the candidates from which optima are searched. A method that learns the hyperparameters does so
+    first unless the study is resolved. `first` is called with the optimum and its map as soon as they are known.
+    `individuals`: compute each participant's optimum. `alternatives`: compute optima by other methods and another
+    inference. `say` receives the progress above `MANY` participants. Fits that fail do not raise: see
+    `posteriors.certificate`. Raises `InputError` if `cohort` is not a Cohort.
     """
     if not isinstance(cohort, Cohort):
         raise InputError(
@@ -262,20 +273,22 @@ def aggregate_cohort(
 
 
 class _InOrder(contextlib.nullcontext):
-    """In place of a thread where several devices compute together: each process must run the same programs in the same
-    order."""
+    """Executor that computes at once in the caller's thread, for several devices: each process must run the same
+    programs in the same order."""
 
     def submit(self, function: Callable[..., _Result], *args: object) -> Future[_Result]:
-        """The function's result, computed now."""
+        """Call the function now and return a finished future. An exception is raised here, not stored."""
         result: Future[_Result] = Future()
         result.set_result(function(*args))
         return result
 
     def __enter__(self) -> "_InOrder":
+        """This executor."""
         return self
 
 
 def _own_optima(study: Study, posteriors: Posterior, candidates: Float[Array, "m d"], say: SayCount) -> Optimum:
+    """Optimum of each participant, in batches, with progress reports."""
     words = "participants' own optima found (--no-individuals leaves them out)"
     return _in_batches(lambda people: individual_optima(study, people, candidates), posteriors, words, say)
 
@@ -283,8 +296,8 @@ def _own_optima(study: Study, posteriors: Posterior, candidates: Float[Array, "m
 def _by_other_inference(
     study: Study, cohort: Cohort, candidates: Float[Array, "m d"], share: Share | None
 ) -> tuple[RuleMap | None, Optimum]:
-    """The map by the study's rule and its optimum, where everybody is fitted by the other inference; above `MANY`
-    participants the optimum alone, since the map holds another posterior of each."""
+    """Refit all participants by `other_inference`; returns the map by the study's method (None above `MANY`
+    participants, to save memory) and its optimum."""
     other = other_inference(study)
     map_ = _rule_map(study, cohort, study.rule, fit_cohort(study, cohort, inference=other), share, other)
     optimum = map_optimum(study, map_, candidates)
@@ -292,8 +305,8 @@ def _by_other_inference(
 
 
 def _rules(study: Study, cohort: Cohort, share: Share | None) -> list[str]:
-    """The study's rule, and those whose optima stand beside its own, as far as these answers allow them; first the one
-    that learns the share."""
+    """The methods whose maps are computed: the study's, and those with given hyperparameters that the number of
+    responses and a known `share` allow, the hierarchical one first."""
     few = cohort.counts().sum() <= _LARGEST_POOL
     given = sorted((RULES[name] for name in GIVEN), key=lambda rule: not rule.learns_share)
     beside = [r.name for r in given if (few or not r.exact_only) and (share is not None or not r.learns_share)]
@@ -303,7 +316,8 @@ def _rules(study: Study, cohort: Cohort, share: Share | None) -> list[str]:
 def _rule_map(
     study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: Share | None, inference: str | None = None
 ) -> RuleMap:
-    """The map by a rule from everybody's posteriors, or from all answers where the rule takes them at once."""
+    """Map by a method, from the posteriors or from all responses at once, as the method requires. A method that learns
+    must be resolved."""
     if RULES[rule].learns:
         assert study.learnt is not None
         return learnt_map(study.learnt, cohort.trials)
@@ -319,8 +333,8 @@ def _rule_map(
 
 
 def asked_variance(map_: RuleMap, cohort: Cohort) -> Float[Array, ""] | None:
-    """Largest variance of a map at a point that somebody answered, a scalar; None of more than `MANY` participants by a
-    rule that does not ask for it, since it takes everybody's prediction at everybody's points."""
+    """Largest variance of a map at a tested stimulus, a scalar: the map's `reach` if it has one. None for a larger
+    cohort than `MANY` without it, because all participants would have to be predicted at all stimuli."""
     if map_.reach is not None:
         return map_.reach
     if len(cohort.names) > MANY:

@@ -1,8 +1,8 @@
-"""Where joint draws of a map are largest: what the answers say of where the best rendering is.
+"""Posterior distribution of the optimum: the points at which joint draws of a map are largest.
 
-The points are spread evenly over the feasible set, its walls included. Their shares of the draws are the posterior
-probability, point by point, that nothing is better; with functions by several draws of the hyperparameters, these are
-integrated out.
+The points are spread evenly over the feasible set, its walls included. The fraction of draws that are largest at a
+point is the posterior probability that this point is the best of them; with posteriors under several draws of the
+hyperparameters, these are integrated out.
 """
 
 from collections.abc import Sequence
@@ -25,26 +25,29 @@ from hilbo.search.space import SearchSpace
 __all__ = ["DRAWS", "POINTS", "BestPlaces", "best_places", "nearness"]
 
 POINTS = 800
-"""Inside the feasible set; a quarter more are on its walls."""
+"""Number of points inside the feasible set; a quarter as many are added on its walls."""
 DRAWS = 4000
-"""Which say where the best is; a region that holds 95 % takes more."""
+"""Number of joint draws for the location of the optimum; a 95 % region needs more."""
 _AT_A_TIME = 2  # functions: their arithmetic is of one core each
 _NEAR = 0.5  # lengths of the kernel
 
 
 class BestPlaces(NamedTuple):
-    """Even points of the unit cube, and how often each was the best."""
+    """Even points of the unit cube, and the fraction of joint draws of which each was the maximum."""
 
     points: Float[Array, "m d"]
     share: Float[Array, " m"]
-    """Of the draws that are largest at each point."""
+    """Fraction of draws that are largest at each point."""
 
 
 def best_places(
     space: SearchSpace, functions: Sequence[Posterior], seed: int = 0, count: int = POINTS, draws: int = DRAWS
 ) -> BestPlaces:
-    """By `draws` joint draws of equally probable posteriors, as many of each, at `count` even points, and a quarter as
-    many on the walls."""
+    """Distribution of the optimum over `count` even points of the feasible set and a quarter as many on its walls.
+
+    `functions`: equally probable posteriors, of each of which draws / number of posteriors (rounded up) are drawn. Two
+    posteriors are processed at a time, in threads.
+    """
     points, each = search_points(space, seed, count), -(-draws // len(functions))
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
         seeds = map(to_device, range(seed, seed + len(functions)))
@@ -54,18 +57,19 @@ def best_places(
 
 @program
 def _shares(function: Posterior, points: Float[Array, "m d"], seed: ArrayLike, draws: int) -> Float[Array, " m"]:
+    """Fraction (m,) of `draws` joint draws of one posterior that are largest at each point."""
     return posterior_map(function, points).optima(jax.random.key(seed), draws)
 
 
 def nearness(
     kernel: Stationary, points: Float[Array, "m d"], share: Float[Array, " m"], x: Float[Array, " d"]
 ) -> Float[Array, ""]:
-    """The mean of exp(-s^2 / (2 * 0.5^2)) over the draws, s the distance of `x` from the best place of a draw in
-    lengths of the kernel.
+    """Mean of exp(-s^2 / (2 * 0.5^2)) over the draws, a scalar; s is the distance of `x` from the best point of a draw
+    in length scales of the kernel. `points` (m, d), `share` (m,): as in `BestPlaces`.
 
-    Where it is largest the best rendering is most often near. Where draws scatter about one place that is their middle;
-    of several places it is in the most crowded one, never between them. It is the decision for a loss that no longer
-    grows from about a length on: so far away one wrong rendering is as wrong as another.
+    Its maximum is the point that the best stimulus is most often near: the middle of one cluster of draws, and for
+    several clusters a point in the densest, never between them. It is the Bayes decision for a loss that no longer
+    grows beyond about one length scale.
     """
     narrow = RBF(kernel.theta / _NEAR**2, jnp.ones_like(kernel.variance), kernel.levels)
     return share @ jax.vmap(lambda place: narrow(x, place))(points)

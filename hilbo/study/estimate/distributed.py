@@ -1,12 +1,13 @@
-"""Several devices and several processes: who takes part, how work is dealt out, and how a failure ends all of them.
+"""Several devices and several processes: roles of the processes, distribution of work, and joint termination on
+failure.
 
-People are sharded over the devices of all processes (`hilbo.numerics.sharding`). Each process reads all data and runs
-the same programs in the same order, whose results are copied to all of them, so that each goes on with the same
-numbers. Processes find each other by `jax.distributed`: under Slurm and Open MPI by themselves, elsewhere by the
-address of process 0. On CPUs they talk by gloo.
+Participants are sharded over the devices of all processes (`hilbo.numerics.sharding`). Each process reads all data and
+runs the same programs in the same order; results are copied to all processes. They find each other by
+`jax.distributed`: automatically under Slurm and Open MPI, elsewhere by the address of process 0. On CPUs they
+communicate by gloo.
 
-Nobody waits for ever: bad input is exchanged before work begins, so that all stop with a sentence; a process that dies
-later breaks the next exchange, or is missed by JAX's heartbeats, and the others end with an error.
+No process waits for ever: bad input is exchanged before work begins, so that all stop with a message; if a process dies
+later, the next exchange fails, or JAX's heartbeat misses it, and the others end with an error.
 """
 
 import contextlib
@@ -35,14 +36,14 @@ class AgreedError(InputError):
 
 
 class Crew(NamedTuple):
-    """Which process this is, and of how many."""
+    """Index (`rank`) of this process and number (`count`) of all processes."""
 
     rank: int
     count: int
 
     @property
     def writes(self) -> bool:
-        """Whether this process writes the results and reports progress: the first one does."""
+        """Whether this process writes the results and reports progress: only process 0 does."""
         return self.rank == 0
 
     @staticmethod
@@ -52,9 +53,11 @@ class Crew(NamedTuple):
 
     @contextlib.contextmanager
     def agreement(self) -> Iterator[Callable[[str], None]]:
-        """Work on the input that all processes must do alike; gives a function that takes a digest of what was read.
+        """Context manager for reading input, which all processes must enter. Gives a function to call with a digest of
+        what was read.
 
-        If it is an `InputError` in any process, or the digests differ, there is one in all of them.
+        At its end all processes wait for each other. Raises `AgreedError` in all of them if one raised `InputError` in
+        the block, or if the digests differ. Other exceptions pass without an exchange.
         """
         read = []
         try:
@@ -73,7 +76,8 @@ class Crew(NamedTuple):
             )
 
     def _exchange(self, text: str) -> UInt8[np.ndarray, "count 8"]:
-        """A mark of everybody's text, (count, 8); 0 for an empty one."""
+        """First 8 bytes of the SHA-256 of each process's text, (count, 8), zeros for an empty text. Waits for all
+        processes."""
         mark = np.frombuffer(hashlib.sha256(text.encode()).digest()[:8], np.uint8) if text else np.zeros(8, np.uint8)
         if self.count == 1:
             return mark[None]
@@ -84,9 +88,11 @@ class Crew(NamedTuple):
 def crew(
     distributed: bool, coordinator: str | None = None, processes: int | None = None, process: int | None = None
 ) -> Iterator[Crew]:
-    """The crew for a block of work; one process unless `distributed`. To be entered before JAX computes anything.
+    """Context manager that gives this process's `Crew`; to be entered before JAX computes anything.
 
-    What ends the block with an error ends the process at once, without waiting for others that wait for it.
+    Without `distributed` it is a single process, and InputError is raised if another option is given. With it, the
+    processes connect first, which raises InputError if it fails. An exception in the block prints a message and ends
+    this process: with exit code 2 for an `AgreedError`, otherwise with 1 and without waiting for the others.
     """
     if not distributed:
         if (coordinator, processes, process) != (None, None, None):
@@ -106,7 +112,8 @@ def crew(
 
 
 def _meet(coordinator: str | None, processes: int | None, process: int | None) -> None:
-    """Find the other processes. Raises `InputError` where they cannot be found."""
+    """Connect to the other processes by `jax.distributed`. Raises `InputError` for bad options, and if that takes too
+    long."""
     if processes is not None and process is not None and not 0 <= process < processes:
         raise InputError(f"--process-id is {process}; it must be from 0 to {processes - 1}, another for each process.")
     if coordinator is not None and not (coordinator.rpartition(":")[0] and coordinator.rpartition(":")[2].isdigit()):
@@ -132,7 +139,8 @@ def _meet(coordinator: str | None, processes: int | None, process: int | None) -
 
 
 def _leave(sentence: str, rank: int, count: int, code: int, wait: bool = True) -> None:
-    """Say why, and end this process; an error that only this one knows of ends it without the others' leave."""
+    """Print a message to stderr and end this process with the exit code `code`, without cleanup. `wait`: shut down in
+    order with the other processes first."""
     try:
         print(f"hilbo: process {rank} of {count}: {sentence}", file=sys.stderr, flush=True)
         if wait:
@@ -142,7 +150,7 @@ def _leave(sentence: str, rank: int, count: int, code: int, wait: bool = True) -
 
 
 def digest(*parts: PyTree) -> str:
-    """A short text that differs where the parts do: records of arrays, texts, numbers."""
+    """SHA-256 (64 hex digits) of nested records, arrays, texts and numbers: their values and their structure."""
     hasher = hashlib.sha256()
     for leaf in jax.tree.leaves(parts):
         is_array = isinstance(leaf, jax.Array | np.ndarray)

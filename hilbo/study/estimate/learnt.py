@@ -1,4 +1,5 @@
-"""A study whose rule learns the hyperparameters, once its answers are there: the learnt model, and the words for it."""
+"""Aggregation methods that learn the hyperparameters from all responses: the study with the learnt model, and its
+description."""
 
 import dataclasses
 import math
@@ -22,15 +23,16 @@ _UNKNOWN = 0.9  # of the prior's standard deviation: the answers hardly say more
 
 
 def that_learns(study: Study, recipe: str = RECOMMENDED) -> Study:
-    """The same study by a recipe that learns: nothing of its [gp] is kept."""
+    """Copy of the study with a method that learns the hyperparameters, without the values of [gp] and what was learnt
+    before; levels are kept, and inference becomes "laplace"."""
     stated = Stated(levels=study.stated.levels)
     gp = prior_model(study.space.dim, len(study.responses), stated)
     return dataclasses.replace(study, rule=recipe, gp=gp, inference="laplace", stated=stated, learnt=None)
 
 
 def by_rule(study: Study, rule: str) -> Study:
-    """The same study by another rule of aggregation. Raises InputError for a rule that there is not, and for one that
-    needs a [gp] where the study learns its own."""
+    """Copy of the study with another aggregation method (the same study if it is that one already). Raises InputError
+    for an unknown or withdrawn method, and for one that needs [gp] if the study's own method learns it."""
     if rule == study.rule:
         return study
     if rule in WITHDRAWN:
@@ -45,7 +47,8 @@ def by_rule(study: Study, rule: str) -> Study:
 
 
 def resolved(study: Study, cohort: Cohort) -> Study:
-    """The study with the model that its answers say, where its rule learns; else the study itself."""
+    """Copy of the study with the model learnt from the cohort (from a random sample of a large one). The same study if
+    its method does not learn, or has learnt already."""
     if not RULES[study.rule].learns or study.learnt is not None:
         return study
     learnt = learn_from_sample(cohort.trials, len(study.responses), study.stated, RECIPES[study.rule])
@@ -53,8 +56,8 @@ def resolved(study: Study, cohort: Cohort) -> Study:
 
 
 def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
-    """What was learnt, for result.json: the resolved recipe, medians with 95 % intervals, and what is not identified;
-    `names` are the participants'."""
+    """Learnt hyperparameters as a dict for result.json: estimates, 95 % intervals, and the names of those that the data
+    do not identify. None if nothing was learnt. `names`: the participants'."""
     learnt = study.learnt
     if learnt is None:
         return None
@@ -86,8 +89,8 @@ def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
 
 
 def effect_content(study: Study, cohort: Cohort, map_: RuleMap) -> dict[str, Any] | None:
-    """The random effect, for result.json: the variance that was learnt, and what each level with an answer adds to
-    everybody's latent score, with its standard deviation. None where the map has none."""
+    """Random effect as a dict for result.json: learnt variance, and for each level with a response its posterior mean
+    and standard deviation, which are added to the latent score. None if the map has none."""
     effects, trials = map_.effects, cohort.trials
     if effects is None:
         return None
@@ -104,8 +107,8 @@ def effect_content(study: Study, cohort: Cohort, map_: RuleMap) -> dict[str, Any
 
 
 def _coordinates(study: Study, learnt: Learnt) -> list[tuple[str, tuple[float, float], bool]]:
-    """Name, 95 % interval and whether the answers say more than the prior, of what is learnt of all people. In units
-    of the noise: distances between thresholds, and variances."""
+    """A row per learnt hyperparameter: name, 95 % interval, and whether it is identified (posterior sd below 0.9 of the
+    prior's). Threshold distances and variances are in units of the noise; per-participant widths are left out."""
     rows = []
     for name, value in learnt.coordinates.items():
         if name == "widths":
@@ -123,7 +126,8 @@ def _coordinates(study: Study, learnt: Learnt) -> list[tuple[str, tuple[float, f
 
 
 def learnt_sentences(study: Study) -> list[str]:
-    """What must be said of a learnt model: what it could not learn, and what may bend it."""
+    """Warnings about a learnt model: sample instead of all, hyperparameters that are not identified, fixed thresholds,
+    no convergence. Empty if nothing was learnt."""
     learnt = study.learnt
     if learnt is None:
         return []

@@ -1,4 +1,5 @@
-"""Where an optimum lies, in sentences: at an edge of what was searched, or where nobody was asked."""
+"""Location of an optimum in sentences: at a range limit, on a constraint or a limit of the device, or an
+extrapolation."""
 
 import dataclasses
 import math
@@ -21,26 +22,29 @@ _BORDERS = {
 
 
 class _Edges(NamedTuple):
-    """What holds a point: ends of the search ranges, constraints, and the border of what the renderer may do."""
+    """The limits that an optimum lies on: ends of the search ranges, constraints, and limits of the renderer."""
 
     ends: list[str]
     constraints: list[str]
     border: list[tuple[str, str, tuple[str, str]]]
-    """A parameter that could not be "higher" or "lower" there; by what, in words for a sentence and for a note."""
+    """Parameter, direction ("higher" or "lower") that the renderer does not allow there, and the limit in words, for a
+    sentence and for a note."""
 
 
 def optimum_sentence(study: Study, x: Float[Array, " d"]) -> str:
-    """The optimum x (d,) of the unit cube in the study's units."""
+    """Sentence with the population optimum, x (d,) in the unit cube, in physical units."""
     return f"The population optimum is {_rendering(study, x)}."
 
 
 def truth_sentence(study: Study, truth: Float[np.ndarray, " d"], nrmse: float) -> str:
-    """A simulated study's true optimum (d,) of the unit cube, and how far from it the one that was found is."""
+    """Sentence with the true optimum of a simulated study, `truth` (d,) in the unit cube, in physical units, and the
+    distance of the estimate, `nrmse`, in %."""
     far = f"the optimum found is {100 * nrmse:.1f} % of the search ranges away (NRMSE)"
     return f"The true optimum of these simulated people is {_rendering(study, truth)}; {far}."
 
 
 def _rendering(study: Study, x: Float[ArrayLike, " d"]) -> str:
+    """A point of the unit cube as text: "NAME = VALUE UNIT, …"."""
     values = np.asarray(study.space.to_physical(np.asarray(x)))
     return ", ".join(
         f"{parameter.name} = {parameter.words(value)}{f' {parameter.unit}' if parameter.unit else ''}"
@@ -51,8 +55,11 @@ def _rendering(study: Study, x: Float[ArrayLike, " d"]) -> str:
 def location_sentences(
     study: Study, x: Float[Array, " d"], sd: Float[Array, ""], asked: Float[Array, ""] | None
 ) -> list[str]:
-    """What must be said of an optimum x (d,) of the unit cube, where the map has the standard deviation `sd`; `asked`:
-    its largest variance where somebody answered (None: not known)."""
+    """Warnings about the location of an optimum x (d,) in the unit cube; an empty list if there are none.
+
+    `sd`: the map's standard deviation at x; `asked`: the map's largest variance at a tested stimulus, above which x is
+    an extrapolation (None: not checked).
+    """
     edges, sentences = _edges(study, np.asarray(x)), []
     if edges.ends:
         sentences.append(
@@ -80,7 +87,7 @@ def location_sentences(
 def location_notes(
     study: Study, x: Float[Array, " d"], sd: Float[Array, ""], asked: Float[Array, ""] | None
 ) -> list[str]:
-    """The same in a few words each, for a row of a table; arguments as above."""
+    """As `location_sentences`, in a few words each, for a table."""
     edges = _edges(study, np.asarray(x))
     notes = [f"at {end}" for end in edges.ends]
     notes += [f"on the constraint {words}" for words in edges.constraints]
@@ -91,10 +98,12 @@ def location_notes(
 
 
 def _extrapolates(sd: Float[Array, ""], asked: Float[Array, ""]) -> bool:
+    """Whether `sd` exceeds the square root of the variance `asked`."""
     return float(sd) > (1.0 + _AT) * math.sqrt(float(asked))
 
 
 def _edges(study: Study, x: Float[np.ndarray, " d"]) -> _Edges:
+    """The limits within 1e-6 of the point x (d,) of the unit cube; parameters with levels have none."""
     inner, edges = np.asarray(study.space.to_box(x)), _Edges([], _constraints(study, x), [])
     for i, parameter in enumerate(study.space.parameters):
         if parameter.levels:
@@ -112,7 +121,7 @@ def _edges(study: Study, x: Float[np.ndarray, " d"]) -> _Edges:
 
 
 def _constraints(study: Study, x: Float[np.ndarray, " d"]) -> list[str]:
-    """The sides of constraints that hold a point, in words."""
+    """Texts of the one-sided constraints that are active (within 1e-6) at the point x (d,) of the unit cube."""
     parameters, held = study.space.parameters, []
     low, high = (np.array([getattr(p, end) for p in parameters]) for end in ("low", "high"))
     shares = (np.asarray(study.space.to_physical(x)) - low) / (high - low)

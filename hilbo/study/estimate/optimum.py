@@ -1,7 +1,7 @@
-"""Optima of maps: where a population's map, or one person's posterior mean, is largest in the feasible set.
+"""Optima of maps: the feasible point at which a population map, or a participant's posterior mean, is largest.
 
-A population's map is a committee machine over posteriors (`hilbo.bcm`), or what a rule says (`hilbo.population.maps`);
-its optimum is searched like a session's.
+A population map is a committee machine over posteriors (`hilbo.bcm`), or that of another aggregation method
+(`hilbo.population.maps`); its optimum is searched as in a session.
 """
 
 import dataclasses
@@ -43,10 +43,9 @@ _LOSS = 0.05  # of the probability of the highest answer, for an optimum in the 
 
 
 class Optimum(eqx.Module):
-    """A point of the unit cube at which a map is largest, and the map there; leading axes for several.
-
-    Of a population, `mean` and `sd` are the map's own, and the class probabilities those of a new person's answer.
-    """
+    """A point `x` of the unit cube at which a map is largest, and mean and standard deviation of the latent score
+    there; leading axes for several. Of a population, `mean` and `sd` are the map's own, and the class probabilities
+    those of a new participant's response."""
 
     x: Float[Array, "*s d"]
     mean: Float[Array, "*s"]
@@ -54,6 +53,7 @@ class Optimum(eqx.Module):
     class_probabilities: Float[Array, "*s C"]
 
     def __repr__(self) -> str:
+        """One line with the point, mean ± sd, and class probabilities."""
         f, chances = f"{shown(self.mean)} ± {shown(self.sd)}", shown(self.class_probabilities)
         return f"Optimum(x={shown(self.x)} of the unit cube, f = {f}, answers {chances})"
 
@@ -62,9 +62,10 @@ class Optimum(eqx.Module):
 def predict_people(
     posteriors: Posterior, x: Float[Array, "m d"], rule: str = "bcm", share: Float[Array, ""] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Mean and variance (m,) of the population map at points of the unit cube, aggregated point by point.
+    """Mean and variance (m,) of the population map of stacked posteriors at points of the unit cube.
 
-    Participants' predictions are never held all at once. `share`: of the hierarchical rule.
+    Participants are added one by one, which bounds memory. `rule`: an aggregation method that works point by point;
+    `share`: shared fraction of the prior variance, for the hierarchical one, otherwise None.
     """
     prior = jax.vmap(jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel.diagonal)(x)
     return pointwise.merged(rule, posteriors, x, prior, share)
@@ -77,6 +78,7 @@ def predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m
 
 @program
 def _predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Compiled `predict_map`."""
     return map_.predict(x)
 
 
@@ -87,15 +89,17 @@ def population_optimum(
     rule: str = "bcm",
     share: Float[Array, ""] | None = None,
 ) -> Optimum:
-    """Where the population map's mean is largest in the feasible set.
+    """Optimum of a map of stacked posteriors by a method that works point by point: the feasible maximum of its mean.
 
-    `posteriors`: stacked, M people; `candidates` (m, d) feasible points of the unit cube.
+    `posteriors`: stacked, M participants; `candidates` (m, d): feasible points of the unit cube from which the search
+    starts; `rule`, `share`: as in `predict_people`.
     """
     return _population_optimum(study.gp, study.space, posteriors, candidates, rule, share)
 
 
 @program
 def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidates, rule, share) -> Optimum:
+    """Compiled `population_optimum`."""
     apart = 0.0 if share is None else (1.0 - share) * gp.kernel.variance
     values = predict_people(posteriors, candidates, rule, share)[0]
     return _optimum(
@@ -104,10 +108,13 @@ def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidate
 
 
 def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
-    """Where a rule's map has its largest mean in the feasible set; by a recipe that learns where a new person answers
-    with the highest category most often; or what the best rendering is most often near, of places where a new person
-    does so at most `_LOSS` less often. Among points of which the answers tell as much as of some that were asked.
-    `candidates` (m, d): feasible points of the unit cube, where the search begins.
+    """Optimum of a map in the feasible set. `candidates` (m, d): feasible points of the unit cube from which the search
+    starts.
+
+    For a method with given hyperparameters it is the maximum of the mean. For one that learns them it is the maximum of
+    the probability that a new participant gives the highest response, or, if the map is `centred`, of `nearness` to the
+    best points of joint draws where that probability is within 0.05 of its maximum. In both cases only points where the
+    map's variance is at most that of some tested stimulus are considered (`RuleMap.reach`).
     """
     if map_.centred:
         assert map_.shared is not None
@@ -117,8 +124,8 @@ def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) ->
 
 
 def _nameless(map_: RuleMap) -> RuleMap:
-    """The map without the name of its rule where it predicts alike by all: from one function's posterior. One program
-    then serves them."""
+    """The same map, renamed to "hierarchical" if it comes from one joint posterior with given hyperparameters:
+    predictions are the same, and all such methods then share one compiled program."""
     exact = map_.method == "exact" and not RULES[map_.rule].learns
     return dataclasses.replace(map_, rule="hierarchical") if exact else map_
 
@@ -127,6 +134,7 @@ def _nameless(map_: RuleMap) -> RuleMap:
 def _map_optimum(
     likelihood: OrdinalProbit, space: SearchSpace, map_: RuleMap, candidates: Float[Array, "m d"]
 ) -> Optimum:
+    """Compiled `map_optimum` for maps that are not centred."""
     if not RULES[map_.rule].learns:
         single = jnp.float32  # which ranks the candidates; the best are scored again
         values = predict_map(map_.astype(single), candidates.astype(single))[0]
@@ -157,8 +165,8 @@ def _centre(
     places: Float[Array, "p d"],
     share: Float[Array, " p"],
 ) -> Optimum:
-    """What the best rendering is most often near, where a new person gives the highest answer nearly as often as at the
-    best of the candidates; `share`: how often each of the places was the best of a draw."""
+    """Compiled `map_optimum` for centred maps. `places` (p, d), `share` (p,): points, and how often each was the best
+    of a joint draw."""
     assert map_.shared is not None
     near = partial(nearness, map_.shared.gp.kernel, places, share)
     mean, variance = map_.predict(candidates)
@@ -177,12 +185,13 @@ def _centre(
 def _log_chance(
     likelihood: OrdinalProbit, map_: RuleMap, mean: Float[Array, " m"], variance: Float[Array, " m"]
 ) -> Float[Array, " m"]:
-    """Log probability of a new person's highest answer, by means and variances of the map."""
+    """Log probability (m,) of a new participant's highest response, from the map's mean and variance."""
     return log_highest(likelihood, mean, variance + map_.apart, map_.widths)
 
 
 def _reach(map_: RuleMap, variances: Float[Array, " m"]) -> Float[Array, ""]:
-    """Largest variance that an optimum may have: that of some point that was asked; or the candidates' least."""
+    """Upper limit of the map's variance at an optimum: `RuleMap.reach` (largest variance at a tested stimulus), or the
+    candidates' smallest variance if that is larger."""
     assert map_.reach is not None
     return jnp.maximum(map_.reach, jnp.min(variances))
 
@@ -198,9 +207,12 @@ def _optimum(
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
     widths: bool = False,
 ) -> Optimum:
-    """`values`: of the candidates, by which they are ranked; `apart`: variance of one person's function about the
-    map's; `score`: what is largest at the optimum, by default the mean; `allowed`: where it may be; `widths`: whether
-    people differ in them."""
+    """Maximise a score over the feasible set, and evaluate the map at the maximum.
+
+    `predict`: points (m, d) -> mean and variance (m,). `values`: score of each candidate. `apart`: variance of an
+    individual's function around the map, added for the class probabilities. `score`: score of one point, by default the
+    mean. `allowed`: constraint on one point. `widths`: whether participants differ in their widths of categories.
+    """
     choice = acquisition.maximise(
         values,
         candidates,
@@ -215,16 +227,18 @@ def _optimum(
 
 
 def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
-    """Where each participant's posterior mean is largest in the feasible set, stacked; one after the other.
+    """Optimum of each participant's posterior mean in the feasible set, stacked: all arrays of the result begin with M.
 
-    `posteriors`: stacked, M people; `candidates` (m, d) feasible points of the unit cube. All arrays of the result
-    begin with M.
+    `posteriors`: stacked, M participants; `candidates` (m, d): feasible points of the unit cube from which the searches
+    start.
     """
     return _individual_optima(study.space, posteriors, candidates)
 
 
 @program
 def _individual_optima(space: SearchSpace, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
+    """Compiled `individual_optima`; one participant after the other on a CPU, in batches of 256 elsewhere."""
+
     def one(posterior, space, candidates):
         x = best_point(space, posterior, candidates).x
         mean, variance = posterior.predict(x[None, :])
@@ -240,7 +254,8 @@ def _individual_optima(space: SearchSpace, posteriors: Posterior, candidates: Fl
 
 
 def best_point(space: SearchSpace, posterior: Posterior, candidates: Float[Array, "m d"]) -> Choice:
-    """Where the posterior mean is largest in the feasible set (paper, algorithm 1), searched from `candidates`."""
+    """Feasible maximum of one posterior's mean (paper, algorithm 1), searched from `candidates`; these are ranked in
+    float32."""
     return acquisition.maximise(
         posterior.astype(jnp.float32).mean(candidates.astype(jnp.float32)),
         candidates,

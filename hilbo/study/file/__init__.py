@@ -1,4 +1,4 @@
-"""The study file: its schema, what must fit together in it, and the record that is read from it; the plan of sessions.
+"""The study file: its schema, checks of its content, and the record of it; the plan of sessions.
 
 Loads no JAX, so that plans, logs and devices can be checked at once.
 """

@@ -1,7 +1,7 @@
 """The data dictionary: unit and meaning of each column of the tables that `hilbo export` and `hilbo report` write.
 
-Sidecars of an export, dictionary.csv of a report, the page docs/guides/columns.md, and the names that no parameter may
-have are all taken from here. Loads no JAX.
+Source of the sidecars of an export, dictionary.csv of a report, the page docs/guides/columns.md, and the names that no
+parameter may have. Loads no JAX.
 """
 
 import csv
@@ -20,6 +20,7 @@ EXPORTED = ("trials", "validation", "sets", "presentations", "sessions")
 
 
 def _read() -> dict[str, dict[str, Meaning]]:
+    """Read hilbo/data/columns.csv: table -> column -> (unit, meaning)."""
     tables: dict[str, dict[str, Meaning]] = {}
     text = (Path(__file__).parents[2] / "data" / "columns.csv").read_text(encoding="utf-8")
     for row in csv.DictReader(text.splitlines()):
@@ -34,13 +35,13 @@ _K0: Meaning = ("N/mm", "stiffness of the spring, derived from the effective sti
 
 
 def presented_column(side: str, name: str) -> str:
-    """The column of what was presented on side a or b; no parameter's own column, and no other, is called so."""
+    """Column name of a parameter's value as confirmed to be presented on a side ("a" or "b"): `presented_SIDE_NAME`."""
     return f"presented_{side}_{name}"
 
 
 def meanings(table: str, space: Box) -> dict[str, Meaning]:
-    """The columns of a table in a study with this search space. A table's own column comes before a parameter of that
-    name. Raises KeyError for no table of the dictionary."""
+    """Column -> (unit, meaning) of a table in a study with this search space: K0, the parameters, presented values, and
+    the table's own columns, which replace a parameter of the same name. Raises KeyError for an unknown table."""
     units = {p.name: (p.unit, f", {p.range_words}" if p.levels else "") for p in space.parameters}
     columns = {"K0": _K0} | {name: (unit, f"value of the parameter{levels}") for name, (unit, levels) in units.items()}
     for side in "ab":
@@ -53,7 +54,8 @@ def meanings(table: str, space: Box) -> dict[str, Meaning]:
 
 
 def _by_the_study(constrained: bool, rendered: bool, damped: bool) -> dict[str, Meaning]:
-    """Reasons of an end of a tolerance interval, and flags of a location, by what the study has."""
+    """Meanings of the columns `low_end` and `location`, whose possible values depend on what the study has:
+    constraints, a renderer, a range of effective damping."""
     ends, places = ["another response", "the range"], ["range limit"]
     if constrained:
         ends, places = [*ends, "a constraint"], [*places, "constraint boundary"]

@@ -14,9 +14,10 @@ _EXAMPLE = '"a + 2*b <= 3" or "0 <= a - b <= 1"'
 
 
 def constraint_of(text: str, names: Sequence[str]) -> Constraint:
-    """The constraint that a text states of parameters with these names.
+    """Parse a linear constraint on the parameters `names`, such as "a + 2*b <= 3".
 
-    Sums of them and of numbers, compared by <= or >= once, or twice between two numbers. Raises `InputError`.
+    Sums of weighted parameters and numbers, compared by <= or >= once, or twice with numbers at both ends. Raises
+    `InputError`.
     """
     by_length = sorted(names, key=len, reverse=True)  # of "a" and "a b" the longer one is meant
     known = "|".join(re.escape(name) for name in by_length)
@@ -37,7 +38,10 @@ def constraint_of(text: str, names: Sequence[str]) -> Constraint:
 
 
 def _sum(text: str, side: str, names: Sequence[str], known: str) -> tuple[dict[str, float], float]:
-    """The weight of each parameter on one side, and the number that stands there."""
+    """Parse one side of a constraint; returns the weight of each parameter in it, and the sum of its numbers.
+
+    `text`: whole constraint, for messages; `known`: regular expression of the parameters' names. Raises InputError.
+    """
     term = re.compile(rf"\s*([+-]?)\s*(?:(?:({_NUMBER})\s*\*?\s*)?({known})(?!\w)|({_NUMBER})(?![\w.]))\s*")
     weights: dict[str, float] = {}
     number, at = 0.0, 0
@@ -55,7 +59,8 @@ def _sum(text: str, side: str, names: Sequence[str], known: str) -> tuple[dict[s
 
 
 def _unknown(text: str, names: Sequence[str], known: str) -> InputError | None:
-    """What is wrong where a word of the text is no parameter."""
+    """The error for a word of the constraint that is no parameter; None if there is no such word. Returned, not
+    raised."""
     left = re.sub(rf"(?<!\w)(?:{_NUMBER}\s*)?(?:{known})(?!\w)|(?<![\w.]){_NUMBER}", " ", text)
     word = re.search(r"[^\W\d][\w.]*", left)
     if word is None:
@@ -67,6 +72,7 @@ def _unknown(text: str, names: Sequence[str], known: str) -> InputError | None:
 
 
 def _not_understood(text: str) -> InputError:
+    """The error for a constraint that cannot be parsed. Returned, not raised."""
     return InputError(
         f"--constraint is {json.dumps(text, ensure_ascii=False)}; write a sum of parameters and its bound,"
         f" for example {_EXAMPLE}."

@@ -1,4 +1,5 @@
-"""What reads the tables of a study file: every key known and of its type, every mistake one sentence with its place.
+"""Conversion of parsed tables of a study file to records: every key known and of its type, every mistake one sentence
+with the key's path.
 
 A table is a `Table` (msgspec) whose annotations carry the type, the range and the words for both; a field that is
 itself a `Table` is a table within the table.
@@ -36,7 +37,7 @@ __all__ = [
 
 
 def words(description: str, example: str) -> msgspec.Meta:
-    """What a value must be, in words, and how one is written."""
+    """Annotation with the description of a valid value and an example, both used in error messages."""
     return msgspec.Meta(description=description, examples=[example])
 
 
@@ -55,21 +56,23 @@ _T = TypeVar("_T", bound=Table)
 
 
 def read_table(kind: type[_T], raw: Any, path: str) -> _T:
-    """A parsed table as its record. Raises `InputError` with the key's path first."""
+    """Convert a parsed table to its record. `path`: key of the table. Raises `InputError`, which begins with the path
+    of the wrong key."""
     fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
     check_present(missing_keys(kind, raw, path))
     return kind(**{key: _read_field(fields[key].type, value, f"{path}.{key}") for key, value in raw.items()})
 
 
 def _read_field(kind: Any, raw: Any, path: str) -> Any:
-    """A value as its type: a table within the table, or a value of its own."""
+    """Convert the value of a field, which may be a table itself. Raises InputError."""
     if isinstance(kind, type) and issubclass(kind, Table):
         return read_table(kind, raw, path)
     return _read_value(kind, raw, path)
 
 
 def _read_value(kind: Any, raw: Any, path: str) -> Any:
-    """A checked value; the sentence where it is none is made of the words of its annotation."""
+    """Convert and check a value by its annotated type; rejects non-finite numbers and text that a spreadsheet could
+    run. Raises InputError with the description of the annotation."""
     try:
         value = msgspec.convert(raw, kind)
         parts = value if isinstance(value, tuple) else (value,)
@@ -86,7 +89,7 @@ def _read_value(kind: Any, raw: Any, path: str) -> Any:
 
 
 def check_keys(raw: Any, path: str, known: Iterable[str]) -> None:
-    """Refuse what is no table, or has a key that is not known."""
+    """Raise InputError if `raw` is not a table, or has a key that is not in `known`."""
     check_table(raw, path)
     dot = f"{path}." if path else ""
     for key in raw:
@@ -95,9 +98,11 @@ def check_keys(raw: Any, path: str, known: Iterable[str]) -> None:
 
 
 def missing_keys(kind: type[Table], raw: Any, path: str) -> Iterator[str]:
-    """Paths of the required keys that a parsed table lacks, and of those that the tables within it lack.
+    """Yield the paths of required keys that a parsed table lacks, nested tables included.
 
-    Raises `InputError` for what is no table, or has a key that is not known: it may be a missing one, misspelt."""
+    Raises `InputError`, while iterated, for a value that is no table, and for an unknown key, which may be a misspelt
+    one.
+    """
     fields = msgspec.structs.fields(kind)
     check_keys(raw, path, [field.encode_name for field in fields])
     for field in fields:
@@ -109,7 +114,7 @@ def missing_keys(kind: type[Table], raw: Any, path: str) -> Iterator[str]:
 
 
 def check_present(missing: Iterable[str], rest: str = "") -> None:
-    """Refuse what lacks these keys, all of them in one sentence, which `rest` ends."""
+    """Raise InputError that lists these keys as missing; do nothing if there are none. `rest`: end of the message."""
     keys = list(missing)
     if keys:
         first, *others = keys
@@ -118,7 +123,8 @@ def check_present(missing: Iterable[str], rest: str = "") -> None:
 
 
 def check_table(raw: Any, path: str) -> Mapping[str, Any]:
-    """The table; refuses what is none, and one whose name would be run as a formula at the head of a column."""
+    """Return `raw` unchanged if it is a table. Raises InputError otherwise, and for a table name that a spreadsheet
+    could run as a formula."""
     if runs_in_a_spreadsheet(path.partition(".")[2]):
         raise InputError(f"{path} has a name {FORMULA_WORDS}.")
     if not isinstance(raw, Mapping):
@@ -127,19 +133,20 @@ def check_table(raw: Any, path: str) -> Mapping[str, Any]:
 
 
 def shown(value: Any) -> str:
-    """A value as it stands in a sentence, cut where it is long."""
+    """A value as JSON for messages, cut to 200 characters."""
     text = json.dumps(value, ensure_ascii=False, default=str)
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
 def prefix(source: str, line: int | None = None) -> str:
-    """`file:line: `, or nothing where there is no file."""
+    """Prefix of an error message, "FILE:LINE: " or "FILE: "; "" without a file."""
     place = source if line is None else f"{source}:{line}"
     return f"{place}: " if place else ""
 
 
 def enclosing(path: str, place: str) -> Iterator[str]:
-    """The key path and the tables around it, innermost first; for a material then those of the study itself."""
+    """Yield a key path and then its enclosing tables, innermost first. `place` is "" or the prefix "materials.NAME.":
+    then the same path of the study itself follows."""
     parts = path.rstrip(",:").split(".")
     yield from (".".join(parts[:n]) for n in range(len(parts), len(place.split(".")) - 1 if place else 0, -1))
     if place:
@@ -147,7 +154,8 @@ def enclosing(path: str, place: str) -> Iterator[str]:
 
 
 def lines_of(text: str) -> dict[str, int]:
-    """Line number of every table and key in the file."""
+    """Line number (from 1) of every table and key in the text of a TOML file, by key path; [[tables]] are numbered from
+    1."""
     lines, table, counts = {}, "", Counter()
     for number, line in enumerate(text.splitlines(), 1):
         if header := re.match(r"\s*\[([^\[\]]+)\]", line):
@@ -163,5 +171,5 @@ def lines_of(text: str) -> dict[str, int]:
 
 
 def _path(key: str) -> str:
-    """A key as it stands in the file, without its quotes and blanks."""
+    """A TOML key path without its quotes and blanks."""
     return ".".join(word.strip().strip("\"'") for word in key.split("."))

@@ -1,4 +1,4 @@
-"""What participants read, in the languages that hilbo has texts in: files of hilbo/data/texts. Loads no JAX."""
+"""Texts that participants read, in the languages that hilbo has: files of hilbo/data/texts. Loads no JAX."""
 
 import tomllib
 from functools import cache
@@ -14,8 +14,8 @@ LANGUAGES: dict[LanguageName, str] = {"en": "English", "de": "German", "fr": "Fr
 
 
 class Language(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`texts`: every text, by its key, in which `{trial}`, `{done}` and `{of}` are numbers. `labels`, `definitions`: of
-    the paper's answers. `reviewed`: whether a native speaker has read all of it."""
+    """`texts`: every text by its key, with the placeholders `{trial}`, `{done}` and `{of}` for numbers. `labels`,
+    `definitions`: of the paper's responses. `reviewed`: whether a native speaker has checked all of it."""
 
     texts: dict[str, str]
     labels: dict[str, str]
@@ -25,6 +25,6 @@ class Language(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @cache
 def language(name: LanguageName) -> Language:
-    """The texts of a language."""
+    """The texts of a language, read from hilbo/data/texts on the first call and cached."""
     content = (files("hilbo") / "data" / "texts" / f"{name}.toml").read_text(encoding="utf-8")
     return msgspec.convert(tomllib.loads(content), Language)

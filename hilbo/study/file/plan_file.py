@@ -1,7 +1,7 @@
-"""plan.json, the plan of a study's sessions: one record, read and checked, and its text.
+"""plan.json, the plan of a study's sessions: its record, reading with checks, and its text.
 
-A plan's hash is the first 16 hex digits of the SHA-256 of all else in it, as JSON with sorted keys and no blanks. A log
-holds it, and a file whose hash does not fit has been changed since.
+A plan's hash is the first 16 hex digits of the SHA-256 of its other content, as JSON with sorted keys and no blanks.
+Session logs hold it, and a file whose hash does not match has been changed.
 """
 
 import json
@@ -30,11 +30,11 @@ __all__ = [
 ]
 
 Source = Literal["aggregate", "individual"]
-"""Whose map the sets of a validation are from: the population's, or each participant's own."""
+"""Map that the sets of a validation are read from: the population's, or each participant's."""
 
 
 class Planned(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A trial whose renderings are known in advance: names of sets in the header, and which side is felt first."""
+    """A planned trial: names of the sets presented (of the header's `sets`), and which side is presented first."""
 
     a: str
     b: str | None = None
@@ -42,10 +42,10 @@ class Planned(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Block(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A run of trials of one phase with one material.
+    """Consecutive trials of one phase with one material.
 
-    `count` of them are needed; `trials` are the planned ones, more than `count` for a warm-up, whose others wait for
-    "another one"; none for an optimisation, which chooses them. `rest`: seconds of break before the block.
+    `count`: number of trials that are needed; `trials`: the planned ones. A warm-up has more than `count`, as a
+    reserve; an optimisation has none, since they are chosen during the session. `rest`: break before the block, in s.
     """
 
     phase: Phase
@@ -56,7 +56,7 @@ class Block(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class PlannedSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The part of a session's header that a plan fixes. `sets`: name -> parameters in physical units."""
+    """The part of a session log's header that the plan fixes. `sets`: name -> parameters in physical units."""
 
     study: str
     participant: str
@@ -68,7 +68,8 @@ class PlannedSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PlanRow(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """A participant's place in the order, and session; `reissued_from`: who had them and dropped out."""
+    """A participant's slot in the plan: place in the order, and session; `reissued_from`: the drop-out who had it
+    before."""
 
     participant: str
     order: Annotated[int, msgspec.Meta(ge=0)]
@@ -77,7 +78,8 @@ class PlanRow(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fi
 
 
 class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True, kw_only=True):
-    """One kind of session for all participants of a study. `study` and `hash`: of the study file, and of the plan."""
+    """Plan of one kind of session for all participants of a study. `study`: hash of the study file; `hash`: that of the
+    plan."""
 
     schema: Literal[1]
     study: str
@@ -86,34 +88,35 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     phase: Phase
     source: Source | None
     materials: tuple[str | None, ...]
-    """[None] of a study without."""
+    """(None,) for a study without materials."""
     complete_at: str
-    """For which numbers of participants the orders of materials are balanced, in words,"""
+    """Text: numbers of participants for which the orders of materials are balanced."""
     complete: bool
-    """and whether they are for this number."""
+    """Whether the orders are balanced for this number of participants."""
     participants: Annotated[tuple[PlanRow, ...], msgspec.Meta(min_length=1)]
     replaces: tuple[str, ...] = ()
-    """Its hashes before a row was reissued, or somebody withdrew: logs of these sessions have one of them."""
+    """Hashes of the plan before a slot was reassigned or a participant withdrew; logs of these sessions have one of
+    them."""
     hash: str
 
     @property
     def intact(self) -> bool:
-        """Whether the hash fits."""
+        """Whether the stored hash is that of the plan's content."""
         return self.hash == _hash_of(self)
 
 
 def hashed(plan: Plan) -> Plan:
-    """The plan with the hash of its content."""
+    """Copy of the plan with `hash` set to the hash of its content."""
     return replace(plan, hash=_hash_of(plan))
 
 
 def plan_text(plan: Plan) -> str:
-    """The text of plan.json."""
+    """JSON text of plan.json."""
     return json.dumps(msgspec.to_builtins(plan), indent=1, ensure_ascii=False) + "\n"
 
 
 def plan_in(content: bytes) -> Plan | None:
-    """The plan in the content of a file, whether its hash fits or not; None where there is none."""
+    """Parse a plan from the bytes of a file, without a check of its hash; None if it is not a plan."""
     try:
         return msgspec.json.decode(content, type=Plan)
     except UNREADABLE:
@@ -121,8 +124,8 @@ def plan_in(content: bytes) -> Plan | None:
 
 
 def read_plan(path: str | os.PathLike) -> Plan:
-    """A plan's file. Raises `InputError` for one that is no plan, was changed after it was made, or names a participant
-    twice."""
+    """Read plan.json. Raises `InputError` for a file that cannot be read or is not a plan, one that was changed after
+    it was made, and one with a repeated participant."""
     plan: Plan = decoded(read_bytes(path), Plan, str(path), "is no plan; make one with hilbo plan")
     if not plan.intact:
         raise InputError(f"{path}: was changed after it was made (its hash does not fit); make a new plan.")
@@ -133,6 +136,7 @@ def read_plan(path: str | os.PathLike) -> Plan:
 
 
 def _hash_of(plan: Plan) -> str:
+    """Hash of the plan's content without its field `hash`: first 16 hex digits of the SHA-256."""
     typed = msgspec.convert(msgspec.to_builtins(plan), Plan)  # a whole number that stands for a float becomes one
     content: dict[str, Any] = msgspec.to_builtins(typed)
     del content["hash"]

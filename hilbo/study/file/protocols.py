@@ -1,9 +1,9 @@
-"""Protocols of a session as data: what is felt and for how long, what is asked, and every text a participant sees.
+"""Protocols of a session as data: presentations and their durations, questions, and every text for participants.
 
-A trial is a list of steps (the reference, rendering a, rendering b, a neutral interval) with their durations, then
-questions. Four phases are ready (paper, "Experimental Protocol" and "Sessions"): `warm-up`, `optimisation`,
-`validation` (pairs out of best, mid and worst: two classes and a preference) and `aggregate-best` (a preference).
-The study file's optional table [session] changes them:
+A trial is a list of steps (the reference, stimulus a, stimulus b, a neutral interval) with their durations, then
+questions. Four phases are predefined (paper, "Experimental Protocol" and "Sessions"): `warm-up`, `optimisation`,
+`validation` (pairs out of best, mid and worst: two classes and a preference) and `aggregate-best` (a preference). The
+study file's optional table [session] changes them:
 
     [session]
     protocol_number = "2025-17"            # of the ethics approval
@@ -13,11 +13,11 @@ The study file's optional table [session] changes them:
     [session.texts]
     question = "…"                         # any key of hilbo/data/texts/en.toml
     [session.labels]
-    close = "…"                            # how an answer is written on its button
+    close = "…"                            # button text of a response
     [session.definitions]
-    close = "…"                            # what it means
+    close = "…"                            # explanation of a response
 
-Renderings are changed out of contact only: while the participant feels the reference, or during a neutral interval.
+Stimuli are changed out of contact only: while the participant feels the reference, or during a neutral interval.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ PHASES: tuple[Phase, ...] = ("warm-up", "optimisation", "validation", "aggregate
 
 
 class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A part of a trial: what is felt, for how many seconds."""
+    """A part of a trial: the stimulus or interval presented, and its duration in seconds."""
 
     show: Show
     seconds: Annotated[float, msgspec.Meta(gt=0, le=600)]
@@ -91,7 +91,7 @@ class PhaseTable(Table, frozen=True):
 
 
 class SessionTable(Table, frozen=True):
-    """[session]: what a study says of its live sessions."""
+    """[session]: what a study changes of its live sessions: texts, language and phases."""
 
     protocol_number: Annotated[str, words("a text", '"2025-17"')] = ""
     language: Annotated[LanguageName, words("one of " + ", ".join(f'"{name}"' for name in LANGUAGES), '"de"')] = "en"
@@ -105,7 +105,8 @@ class SessionTable(Table, frozen=True):
     aggregate_best: PhaseTable = PhaseTable()
 
     def check(self, responses: Sequence[str]) -> None:
-        """Refuse texts that nobody asks for, and steps that do not show what is asked about. Raises `InputError`."""
+        """Raise `InputError` for unknown keys of texts, labels and definitions, and for steps that do not suit a
+        phase's questions."""
         for name, table, allowed in (
             ("texts", self.texts, tuple(language("en").texts)),
             ("labels", self.labels, tuple(responses)),
@@ -118,32 +119,35 @@ class SessionTable(Table, frozen=True):
             _check_steps(phase, protocol(self, phase))
 
     def text(self, key: str) -> str:
-        """A text that participants see, in the study's words or the shipped ones of its language."""
+        """Text for participants by its key: the study's own, otherwise that of its language. Raises KeyError for an
+        unknown key."""
         return self.texts.get(key, language(self.language).texts[key])
 
     def untranslated(self, responses: Sequence[str]) -> list[str]:
-        """The answers whose words on the buttons are in no language but the study file's."""
+        """Responses whose button text is neither in the study's [session.labels] nor in its language; empty for
+        English."""
         known = {**language(self.language).labels, **self.labels}
         return [] if self.language == "en" else [response for response in responses if response not in known]
 
     def label(self, response: str) -> str:
-        """How an answer is written on its button."""
+        """Button text of a response: the study's own, that of its language, or the response with a capital."""
         return self.labels.get(response, language(self.language).labels.get(response, response.capitalize()))
 
     def definition(self, response: str) -> str:
-        """What an answer means."""
+        """Explanation of a response: the study's own, that of its language, or ""."""
         return self.definitions.get(response, language(self.language).definitions.get(response, ""))
 
 
 def protocol(session: SessionTable, phase: Phase) -> Protocol:
-    """A phase as the paper has it, with the study's changes."""
+    """Protocol of a phase: the paper's, with the study's changes of steps, count and rest."""
     table: PhaseTable = getattr(session, phase.replace("-", "_"))
     changes = {key: value for key in ("steps", "count", "rest") if (value := getattr(table, key)) is not None}
     return msgspec.structs.replace(_PRESETS[phase], **changes)
 
 
 def _check_steps(phase: Phase, changed: Protocol) -> None:
-    """Refuse steps that do not show what is asked about."""
+    """Raise InputError unless the steps show "a", show "b" only in a phase that asks for a preference, and have
+    "neutral" or "reference" between them."""
     path = f"session.{phase.replace('-', '_')}.steps"
     shows = [step.show for step in changed.steps]
     if "a" not in shows or ("b" in shows) != ("preferred" in changed.asks):

@@ -1,8 +1,9 @@
-"""A study file, read and checked: all that plans, logs, tables and devices need to know of a study. Loads no JAX.
+"""The study file, read and checked: the record from which plans, logs, tables and devices take what they need. Loads no
+JAX.
 
-A study file is TOML (docs, "Study file"). Whatever is wrong becomes one `InputError`: `file:line: key.path is …, it
-must be …`. The hash is the first 16 hex digits of the SHA-256 of the parsed content as JSON, in the order of the
-schemas, with defaults left out: spelling a default out changes nothing, the order of the parameters does.
+A study file is TOML (docs, "Study file"). Every mistake becomes one `InputError`: `file:line: key.path is …, it must be
+…`. The hash is the first 16 hex digits of the SHA-256 of the parsed content as JSON, in the order of the schemas, with
+defaults left out: writing a default explicitly does not change it, the order of the parameters does.
 """
 
 import hashlib
@@ -34,22 +35,22 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, eq=False)
 class StudyFile:
-    """The content of a study file. Two are equal if their content and their file are."""
+    """The content of a study file. Two are equal if their content and their path are equal."""
 
     name: str
     responses: tuple[str, ...]
     """Labels, lowest first."""
     attribute: str
-    """What is judged, in words: labels of axes."""
+    """Attribute that is rated, such as "perceived realism"; used in axis labels."""
     exclude: str
-    """The rule by which participants are left out (`hilbo.population.judged.response_quality`), empty for none."""
+    """Rule that excludes participants (`hilbo.population.judged.response_quality`), empty for none."""
     exclude_flags: tuple[TrialFlag, ...]
-    """Flags of the device for which an analysis leaves a trial out (`hilbo.study.file.trial_flags`)."""
+    """Flags of the device that exclude a trial from the analysis (`hilbo.study.file.trial_flags`)."""
     space: Box
     """The ranges and constraints of the parameters; with mechanics only a part of it may be passive."""
     gp: GPTable
     rule: str
-    """The method that aggregates participants."""
+    """Name of the aggregation method."""
     selection: Selection
     session: SessionTable
     report: ReportTable
@@ -58,7 +59,7 @@ class StudyFile:
     simulation: SimulationTable | None
     """The participants that `hilbo simulate` and `hilbo power` draw, if the file specifies them."""
     random_effect: str | None
-    """The column of the trial table whose levels have an effect of their own, with a method that learns it."""
+    """Column of the trial table whose levels have a random effect (with a method that learns it); None for none."""
     materials: tuple[str, ...]
     """Names of the materials that override the renderer or the parameters."""
     content: str
@@ -74,25 +75,30 @@ class StudyFile:
 
     @staticmethod
     def load(path: str | os.PathLike) -> "StudyFile":
-        """Read and check a study file. Raises `InputError`, one sentence with the place of the mistake."""
+        """Read and check a study file, without building its model. Raises `InputError`, one sentence with the place of
+        the mistake."""
         return read_study(path, _itself)
 
     @cached_property
     def hash(self) -> str:
-        """First 16 hex digits of the SHA-256 of the content, without [simulation] and [random_effect]: they change
-        nothing that is asked of participants, whose sessions may be over."""
+        """First 16 hex digits of the SHA-256 of the content, without [simulation] and [random_effect]: these do not
+        change the trials of participants, whose sessions may be over."""
         tables = json.loads(self.content)
         hashed = {name: table for name, table in tables.items() if name not in ("simulation", "random_effect")}
         return hashlib.sha256(_as_json(hashed).encode()).hexdigest()[:16]
 
     def material(self, name: str) -> "StudyFile":
-        """The file of one material: its overrides of [renderer] and [parameters] applied. Raises `InputError`."""
+        """The file of one material: its overrides of [renderer] and [parameters] applied. Raises `InputError` for a
+        name that is not in [materials]."""
         return _of_material(self, name)
 
 
 def read_study(path: str | os.PathLike, make: Callable[[StudyFile], _T]) -> _T:
-    """What `make` makes of a study file, of that of each material too, to find mistakes now. InputError says in one
-    sentence what is wrong, with the file or for `make`, and where."""
+    """Read and check a study file; returns `make` of it. `make` is also called for each material's file, to find
+    mistakes early.
+
+    Raises InputError for a file that cannot be read or is invalid, and adds file and line to an InputError of `make`.
+    """
     source = str(path)
     if Path(path).suffix.lower() in (".csv", ".parquet", ".tsv"):
         raise InputError(f"{source}: is a table by its name, and no study file; give a file such as study.toml.")
@@ -106,7 +112,8 @@ def read_study(path: str | os.PathLike, make: Callable[[StudyFile], _T]) -> _T:
 
 
 def checked(raw: Mapping[str, Any], source: str, make: Callable[[StudyFile], _T], text: str = "") -> _T:
-    """As `read_study`, from the parsed tables; `text`: the file's, in which the line of a mistake is looked for."""
+    """As `read_study`, from the parsed tables. `source`: path for messages, or ""; `text`: text of the file, in which
+    the line of a mistake is found. Raises InputError."""
     place = ""
     try:
         check_parsed(raw)
@@ -124,6 +131,7 @@ def checked(raw: Mapping[str, Any], source: str, make: Callable[[StudyFile], _T]
 
 @lru_cache(maxsize=32)  # every event of a log may ask for its block's
 def _of_material(file: StudyFile, name: str) -> StudyFile:
+    """See `StudyFile.material`; the last 32 are cached."""
     if name not in file.materials:
         listed = ", ".join(file.materials) or "there are none"
         raise InputError(f"{prefix(file.source)}materials.{name} is not in the study, its materials: {listed}.")
@@ -131,7 +139,7 @@ def _of_material(file: StudyFile, name: str) -> StudyFile:
 
 
 def _file(raw: Mapping[str, Any], source: str) -> StudyFile:
-    """The file itself, without its materials' overrides."""
+    """The checked StudyFile of parsed tables; overrides in [materials] are not applied. Raises InputError."""
     tables = read(raw)
     box = box_of(tables)
     check_together(tables, box.parameters)
@@ -153,8 +161,10 @@ def _file(raw: Mapping[str, Any], source: str) -> StudyFile:
 
 
 def _as_json(tables: Mapping[str, Any]) -> str:
+    """Compact JSON text of the tables, in their order."""
     return json.dumps(tables, ensure_ascii=False, separators=(",", ":"))
 
 
 def _itself(file: StudyFile) -> StudyFile:
+    """Identity, as the `make` of `read_study`."""
     return file

@@ -1,7 +1,8 @@
-"""What tables call their own columns: a parameter of that name would be taken for one, or overwrite it.
+"""Column names that tables use themselves; no parameter may have one, because it would be confused with it or overwrite
+it.
 
-Of the tables, netCDF files and DataFrames that have a column for each parameter; tests/report/test_reserved_names.py
-compares them. Loads no JAX.
+Covers the tables, netCDF files and DataFrames that have a column for each parameter;
+tests/report/test_reserved_names.py compares them. Loads no JAX.
 """
 
 from collections.abc import Collection
@@ -15,10 +16,10 @@ TRIAL_COLUMNS = (
     *("participant", "trial", "response", "category", "phase", "material", "voided", "unblinded"),
     *(COLUMN, COLUMN_OF_SAMPLES),
 )
-"""Those that the reader of answers knows."""
+"""Columns that the reader of trial tables knows."""
 
 _RENDERED = frozenset(("K0", "N", "T", "memory", "states", "force_limit"))
-"""Beside the parameters of a set that a device renders; without a renderer they are names as others."""
+"""Further columns of a set that a device renders; without a renderer they are not reserved."""
 _OF_CSV = {
     name
     for table in ("trials", "sets", "optima", "alternatives", "comparison")
@@ -34,6 +35,7 @@ _EVERYWHERE = frozenset((*TRIAL_COLUMNS, *_OF_CSV, *(name for names in _OF_FILES
 
 
 def is_reserved(name: str, responses: Collection[str], rendered: bool) -> bool:
-    """Whether no parameter of a study with these answers may be called so. `rendered`: by a [renderer]."""
+    """Whether a parameter may not have this name in a study with these response labels. `rendered`: the study has a
+    [renderer], which reserves more names."""
     predicted = {f"P({label})" for label in responses}
     return name in _EVERYWHERE or name in predicted or (rendered and name in _RENDERED)

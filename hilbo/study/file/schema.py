@@ -36,6 +36,8 @@ Acquisition = Literal["ucb", "log_ei", "thompson", "top_category"]
 
 
 class StudyTable(_Table, frozen=True):
+    """[study]: name, response labels (lowest first), rated attribute and exclusion rules."""
+
     name: Annotated[str, msgspec.Meta(min_length=1), _text("a text", '"memory foam"')]
     responses: Annotated[
         tuple[str, ...],
@@ -50,6 +52,8 @@ class StudyTable(_Table, frozen=True):
 
 
 class ParameterTable(_Table, frozen=True):
+    """[parameters.NAME]: a numeric parameter."""
+
     low: _Number
     high: _Number
     unit: Annotated[str, _text("a text", '"N/mm"')] = ""
@@ -58,7 +62,8 @@ class ParameterTable(_Table, frozen=True):
 
 
 class LevelsTable(_Table, frozen=True):
-    """A parameter of unordered levels. `correlation`: of the latent score at two of them, before any answer."""
+    """[parameters.NAME]: a parameter of unordered levels. `correlation`: prior correlation of the latent score between
+    two levels."""
 
     levels: Annotated[
         tuple[Annotated[str, msgspec.Meta(min_length=1)], ...],
@@ -83,6 +88,8 @@ NO_DELAY = 0.0
 
 
 class RendererTable(_Table, frozen=True):
+    """[renderer]: mechanical model of the hilbo device's rendering."""
+
     K_eff: Annotated[_NotNegative, msgspec.Meta(examples=["0.44"])]
     damping: Annotated[_Positive, msgspec.Meta(examples=["0.95"])]
     model: Annotated[Literal["fosls"], _text('"fosls"', '"fosls"')] = "fosls"
@@ -98,9 +105,10 @@ _Length = Annotated[float, msgspec.Meta(ge=1e-3, le=1e3)]
 
 
 class GPTable(_Table, frozen=True):
-    """[gp]. What is left out is learnt; rules that do not learn require theta or length, and all but `inference`.
+    """[gp]: hyperparameters of the model. Methods that learn take those left out from the data; other methods require
+    all of them, but one of theta and length.
 
-    `length`: over which answers change, as a part of a parameter's range; theta = 1/(2 length^2).
+    `length`: length scale as a fraction of a parameter's range; theta = 1/(2 length^2).
     """
 
     theta: Annotated[
@@ -133,24 +141,26 @@ class Selection(_Table, frozen=True):
 
 
 class AggregationTable(_Table, frozen=True):
+    """[aggregation]: name of the aggregation method."""
+
     rule: Annotated[RuleName, _text("one of " + ", ".join(f'"{name}"' for name in RULES), f'"{DEFAULT}"')] = DEFAULT
 
 
 class RandomEffectTable(_Table, frozen=True):
-    """`column`: of the answers' table, such as the clip, whose levels add something of their own."""
+    """[random_effect]. `column`: of the trial table, such as the clip, whose levels have a random effect."""
 
     column: Annotated[str, msgspec.Meta(min_length=1), _text("the name of a column", '"clip"')]
 
 
 class ReportTable(_Table, frozen=True):
-    """What `hilbo report` says besides. `hypotheses`: what the results say of the paper's hypotheses H1 to H4, and
-    which figure is which of the paper's."""
+    """[report]: additions to `hilbo report`. `hypotheses`: evaluate the paper's hypotheses H1 to H4, and name the
+    paper's figure that each figure corresponds to."""
 
     hypotheses: Annotated[bool, _text("true or false", "true")] = False
 
 
 class Tables(_Table, frozen=True):
-    """The whole file: what the hash is taken of."""
+    """The whole study file as records; its hash is computed from them."""
 
     study: StudyTable
     parameters: dict[str, ParameterTable | LevelsTable]

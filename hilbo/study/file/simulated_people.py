@@ -1,4 +1,4 @@
-"""[simulation]: the people that `hilbo simulate` and `hilbo power` draw for a study, where no preset is asked for."""
+"""[simulation]: the participants that `hilbo simulate` and `hilbo power` draw for a study if no preset is chosen."""
 
 import itertools
 from collections.abc import Sequence
@@ -20,13 +20,14 @@ _Parts = Annotated[
 
 
 class SimulationTable(Table, frozen=True):
-    """People of whom each prefers one rendering; `hilbo.simulation.simulate` has the model.
+    """[simulation]: distribution of the simulated participants, each of whom prefers one stimulus;
+    `hilbo.simulation.simulate` has the model.
 
-    `truth`: parameter -> where their optima lie, physical units; drawn from what may be rendered where it is not
-    stated. `spread`: sd of optima between people, of levels the share who prefer another one, and `tolerance`: the
-    distance at which the highest answer is left, both in parts of the ranges. `criteria`: C - 1 falling distances in
-    tolerances, below the last of which the answer is the highest. `noise`: sd of what is felt, in tolerances. `lapse`:
-    share of answers that are guesses.
+    `truth`: parameter -> centre of their optima, in physical units; drawn from the feasible set if left out. `spread`:
+    between-participant sd of optima (for levels the proportion who prefer another one), and `tolerance`: the distance
+    at which the highest response ends, both as fractions of the ranges. `criteria`: C - 1 falling distances in
+    tolerances, below the last of which the response is the highest. `noise`: sd of the perceived dissimilarity, in
+    tolerances. `lapse`: proportion of random responses.
     """
 
     truth: Annotated[dict[str, float | str], words("a table of numbers or levels", "{hue = 120}")] = msgspec.field(
@@ -41,7 +42,7 @@ class SimulationTable(Table, frozen=True):
     drift_sd: NotNegative = 0.2
 
     def check(self, parameters: Sequence[Parameter], count: int) -> None:
-        """Refuse what does not fit these parameters and `count` responses. Raises `InputError`."""
+        """Raise `InputError` if the table does not fit these parameters and `count` responses."""
         names = [p.name for p in parameters]
         if self.truth and set(self.truth) != set(names):
             raise InputError(f"simulation.truth names {', '.join(self.truth)}; it must name {', '.join(names)}.")
@@ -67,5 +68,5 @@ class SimulationTable(Table, frozen=True):
 
 
 def each(values: float | tuple[float, ...], dim: int) -> tuple[float, ...]:
-    """One number for each of `dim` parameters."""
+    """A tuple of `dim` numbers, one per parameter; a single number is repeated."""
     return values if isinstance(values, tuple) else (values,) * dim

@@ -1,4 +1,4 @@
-"""The tables of a study file: read as records, checked, and what must fit together. Loads no JAX."""
+"""The tables of a study file: parsed into records, and checks of each and of their combination. Loads no JAX."""
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
@@ -33,7 +33,8 @@ _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
 
 
 def read(raw: Mapping[str, Any]) -> Tables:
-    """The parsed file as records, every key known and of its type. Raises `InputError`."""
+    """Convert a parsed study file to records; checks keys and types, and that gp keys are complete for the aggregation
+    method. Lengths of [gp] become theta. Raises `InputError`."""
     check_keys(raw, "", _KEYS)
     _check_complete(raw)
     if raw["schema"] is True or raw["schema"] != 1:
@@ -59,14 +60,15 @@ def read(raw: Mapping[str, Any]) -> Tables:
 
 
 def _constraints(raw: Any) -> tuple[ConstraintTable, ...]:
-    """[[constraints]], each called by its number from 1. Raises `InputError`."""
+    """Convert [[constraints]], named by their number from 1 in messages. Raises `InputError`."""
     if not isinstance(raw, list):
         raise InputError(f"constraints is {shown(raw)}; it must be tables; write each as [[constraints]].")
     return tuple(read_table(ConstraintTable, table, f"constraints.{i}") for i, table in enumerate(raw, 1))
 
 
 def _check_complete(raw: Mapping[str, Any]) -> None:
-    """Refuse a file that lacks keys: all of them at once. Raises `InputError`."""
+    """Raise `InputError` that lists all missing keys of the file, also those of [gp] that its aggregation method needs;
+    also for a withdrawn method, and for unknown keys."""
     missing = [key for key in _REQUIRED if key not in raw]
     kinds = TABLES | {"renderer": RendererTable}
     missing += (key for name, kind in kinds.items() if name in raw for key in missing_keys(kind, raw[name], name))
@@ -83,12 +85,13 @@ def _check_complete(raw: Mapping[str, Any]) -> None:
 
 
 def _kind_of(table: Any) -> type[ParameterTable | LevelsTable]:
-    """The schema of a parameter: of numbers, or of levels."""
+    """Record type of a parameter's table: `LevelsTable` if it has the key "levels", otherwise `ParameterTable`."""
     return LevelsTable if isinstance(table, Mapping) and "levels" in table else ParameterTable
 
 
 def _of_one_kind(table: Any, path: str) -> Any:
-    """The parsed table of a parameter. Raises `InputError` for levels beside what only numbers have."""
+    """The same parsed table of a parameter. Raises `InputError` if it combines levels with keys of numbers, or has a
+    correlation without levels."""
     if _kind_of(table) is LevelsTable:
         beside = next((key for key in table if key in _NUMBERS_KEYS), None)
         if beside is not None:
@@ -99,8 +102,8 @@ def _of_one_kind(table: Any, path: str) -> Any:
 
 
 def _with_theta(table: GPTable, parameters: Collection[ParameterTable | LevelsTable]) -> GPTable:
-    """The same model with its lengths as theta: how they are written is not part of a study's hash. Levels have none,
-    but a correlation."""
+    """The same [gp] with `length` replaced by theta = 1/(2 length^2), so that both notations have one hash. Raises
+    `InputError` for both at once, and for lists whose length is not the number of parameters without levels."""
     dim = sum(isinstance(p, ParameterTable) for p in parameters)
     for name, values in (("theta", table.theta), ("length", table.length)):
         if isinstance(values, tuple) and len(values) != dim:
@@ -120,7 +123,7 @@ def _with_theta(table: GPTable, parameters: Collection[ParameterTable | LevelsTa
 
 
 def box_of(tables: Tables) -> Box:
-    """[parameters] and [renderer]. Raises `InputError`."""
+    """Search space of [parameters], [[constraints]] and [renderer]. Raises `InputError`."""
     parameters = tuple(_parameter(name, table) for name, table in tables.parameters.items())
     constraints = tuple(Constraint(tuple(c.terms.items()), c.least, c.most) for c in tables.constraints)
     if tables.renderer is None:
@@ -137,13 +140,15 @@ def box_of(tables: Tables) -> Box:
 
 
 def _parameter(name: str, table: ParameterTable | LevelsTable) -> Parameter:
+    """The parameter of one table of [parameters]."""
     if isinstance(table, LevelsTable):
         return Parameter.of_levels(name, table.levels, table.correlation)
     return Parameter(name, **msgspec.structs.asdict(table))
 
 
 def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
-    """Refuse tables that do not fit each other, or the parameters. Raises `InputError`."""
+    """Raise `InputError` for tables that contradict each other or the parameters: responses, selection, reserved names,
+    session, stimulus, simulation, [gp] and random effect."""
     labels, selection = tables.study.responses, tables.selection
     if len(set(labels)) < len(labels):
         raise InputError(f"study.responses is {shown(labels)}; it must not have one label twice.")
@@ -175,7 +180,8 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
 
 
 def _check_gp(table: GPTable, rule: str, count: int) -> None:
-    """For `count` responses."""
+    """Raise `InputError` for thresholds that do not rise or do not fit `count` responses, and for a method that learns
+    with another inference than "laplace"."""
     thresholds = table.thresholds
     if thresholds is not None:
         if len(thresholds) != count - 1:
@@ -189,7 +195,7 @@ def _check_gp(table: GPTable, rule: str, count: int) -> None:
 
 
 def of_material(raw: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """The parsed file as it is for one material."""
+    """Parsed file of one material: its overrides applied, and [materials] removed. `name` must be in [materials]."""
     tables = {key: value for key, value in raw.items() if key != "materials"}
     for table, changes in raw["materials"][name].items():
         tables[table] = _merged(tables.get(table, {}), changes)
@@ -197,7 +203,7 @@ def of_material(raw: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def _merged(base: Any, changes: Any) -> Any:
-    """Changes over what they change, table within table."""
+    """`base` updated by `changes`, recursively for nested tables; neither is modified."""
     if not (isinstance(base, Mapping) and isinstance(changes, Mapping)):
         return changes
     return {**base, **{key: _merged(base.get(key, {}), value) for key, value in changes.items()}}

@@ -1,5 +1,4 @@
-"""[stimulus]: what a study asks of the program, or the person, that presents its renderings, where no device of ours
-does."""
+"""[stimulus]: how a program, or a person, presents the stimuli of a study that uses no hilbo device."""
 
 import math
 from collections.abc import Sequence
@@ -19,13 +18,15 @@ _Seconds = Annotated[float, msgspec.Meta(ge=0.1, le=600), words("a number of sec
 
 
 class StimulusTable(Table, frozen=True):
-    """`within`: s from an order until it is confirmed that it is presented. `silence`: s without a word from the
-    program until it counts as gone. `tolerance`: parameter -> how far the confirmed value may be off, in physical
-    units, on a logarithmic scale as a share of the value; a millionth of the range, or of the value, where nothing is
-    said. `unblinded`: who takes part is presented to by their own page, which knows the parameters; answers to any
-    other study that were given so are not aggregated with others'. `by`: whether a program presents, or a person by
-    hand, from the preparer's page. `experimenter_sees`: whether the experimenter is shown the parameters; if nothing is
-    said they are, but where a person presents."""
+    """[stimulus]: presentation by a program or a person.
+
+    `within`: s until a stimulus must be confirmed as presented. `silence`: s without a message until the program counts
+    as disconnected. `tolerance`: parameter -> allowed difference of the confirmed value, in physical units, on a
+    logarithmic scale as a fraction of the value; by default a millionth of the range, or of the value. `unblinded`:
+    stimuli are presented by the participant's own page, which knows the parameters; such responses are not aggregated
+    with blinded ones of other studies. `by`: a program, or a person by hand with the preparer's page.
+    `experimenter_sees`: whether the experimenter is shown the parameters; None: only if a program presents.
+    """
 
     within: _Seconds = 1.0
     silence: _Seconds = 1.0
@@ -37,7 +38,8 @@ class StimulusTable(Table, frozen=True):
     experimenter_sees: Annotated[bool | None, words("true or false", "true")] = None
 
     def check(self, parameters: Sequence[Parameter]) -> None:
-        """Refuse tolerances of what is no parameter, and those that are none. Raises `InputError`."""
+        """Raise `InputError` for a tolerance of an unknown or categorical parameter or of an invalid size, and for
+        times too short for a person who presents."""
         names, levels = [p.name for p in parameters], [p.name for p in parameters if p.levels]
         shares = [p.name for p in parameters if p.scale == "log"]
         for name, value in self.tolerance.items():
@@ -61,28 +63,30 @@ class StimulusTable(Table, frozen=True):
 
     @property
     def role(self) -> Literal["stimulus", "preparer"]:
-        """Who presents, as a role of a session."""
+        """Session role of the presenter: "stimulus" for a program, "preparer" for a person."""
         return "stimulus" if self.by == "program" else "preparer"
 
     @property
     def shown_to(self) -> tuple[str, ...]:
-        """The roles that are shown parameters."""
+        """Session roles to which the parameters are shown: the presenter, and the experimenter unless
+        `experimenter_sees` is false (by default false if a person presents)."""
         sees = self.by == "program" if self.experimenter_sees is None else self.experimenter_sees
         return (self.role, "experimenter") if sees else (self.role,)
 
     def tolerance_of(self, parameter: Parameter) -> float:
-        """How far a confirmed value may be off: in the parameter's unit, on a logarithmic scale as a share of it."""
+        """Allowed difference of a confirmed value: in the parameter's unit, on a logarithmic scale as a fraction of the
+        value; 0 for levels."""
         if parameter.levels:
             return 0.0
         exact = _EXACT if parameter.scale == "log" else _EXACT * (parameter.high - parameter.low)
         return self.tolerance.get(parameter.name, exact)
 
     def off_by(self, parameter: Parameter, wanted: float) -> float:
-        """How far the confirmation of a value may be off, in the parameter's unit."""
+        """Allowed difference of the confirmed value from `wanted`, always in the parameter's unit."""
         return self.tolerance_of(parameter) * (wanted if parameter.scale == "log" else 1.0)
 
     def tolerance_words(self, parameter: Parameter) -> str:
-        """`tolerance_of` in words, such as 0.5 deg, or 1 %."""
+        """`tolerance_of` as text, such as "0.5 deg", or "1 %" on a logarithmic scale."""
         if parameter.scale == "log":
             return f"{100 * self.tolerance_of(parameter):.3g} %"
         return f"{self.tolerance_of(parameter):.3g} {parameter.unit}".rstrip()

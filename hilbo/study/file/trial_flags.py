@@ -1,8 +1,8 @@
 """Flags that the telemetry of a device may mark a trial with, and sentences about them. Loads no JAX and no pandas.
 
 In tables the column `flags` holds the flags of a trial, separated by spaces: "saturated slewed". Other words in it are
-ignored. `telemetry_samples` is the number of samples that were recorded with the trial; it is empty where there was no
-telemetry, which tells such a trial from one without flags. `hilbo.study.tables.flag_counts` reads these columns.
+ignored. `telemetry_samples` is the number of samples that were recorded with the trial; it is empty without telemetry,
+which distinguishes such a trial from one without flags. `hilbo.study.tables.flag_counts` reads these columns.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -27,8 +27,8 @@ COLUMN, COLUMN_OF_SAMPLES = "flags", "telemetry_samples"
 
 
 class FlagCounts(NamedTuple):
-    """Trials that an analysis would take: how many have a record of the device's flags, how many carry each flag, and
-    how many of each participant's are excluded for theirs."""
+    """Counts over the trials that an analysis would use: `recorded`, with a record of the device's flags; `flagged`,
+    flag -> number of trials; `excluded`, participant -> number of trials excluded for a flag."""
 
     recorded: int = 0
     flagged: Mapping[str, int] = {}
@@ -36,22 +36,23 @@ class FlagCounts(NamedTuple):
 
     @property
     def left_out(self) -> int:
-        """Excluded trials of all participants."""
+        """Number of excluded trials, summed over participants."""
         return sum(self.excluded.values())
 
     def content(self) -> dict[str, int | dict[str, int]]:
-        """As result.json has it."""
+        """The counts as a dict for result.json; excluded trials as their sum, `left_out`."""
         return {"recorded": self.recorded, "flagged": dict(self.flagged), "left_out": self.left_out}
 
 
 def flag_words(flags: Iterable[str]) -> str:
-    """The cell of these flags, in their order."""
+    """Text of the table cell for these flags: known ones in the order of `FLAGS`, separated by spaces."""
     carried = set(flags)
     return " ".join(name for name in FLAGS if name in carried)
 
 
 def flag_sentences(counts: FlagCounts, exclude: Collection[str], what: str = "trials") -> list[str]:
-    """How many trials carried which flag, and how many are excluded; nothing where no flag was recorded or excluded."""
+    """One sentence with the number of trials per flag and the number excluded; an empty list if no telemetry was
+    recorded and the study excludes no flag. `what`: plural of what is counted."""
     rule = f"[study] exclude_flags ({', '.join(exclude)})"
     if not counts.recorded:
         return [f"No device flags were recorded for these {what}; {rule} excludes none."] if exclude else []

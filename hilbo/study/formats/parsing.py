@@ -15,7 +15,7 @@ from hilbo.errors import InputError
 __all__ = ["UNREADABLE", "check_parsed", "toml"]
 
 UNREADABLE = (ValueError, RecursionError, msgspec.MsgspecError)
-"""What parsers of TOML and JSON raise for a text that they cannot read."""
+"""Exceptions of the parsers of TOML and JSON for unreadable text."""
 _DEEPEST = 20  # tables and lists within each other; a study file needs 6
 _BITS = 64  # of an integer, by the TOML specification
 

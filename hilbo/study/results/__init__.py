@@ -1,4 +1,4 @@
-"""Files of results: result.json, map.nc, groups for ArviZ, and the list of a results folder.
+"""Files of results: result.json, map.nc, groups for ArviZ, and the list of files in a results folder.
 
-Written with a digest of their numbers and checked when they are read.
+Some carry a digest of their content, which is checked when they are read.
 """

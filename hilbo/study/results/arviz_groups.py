@@ -1,16 +1,18 @@
-"""A material's results for ArviZ: posterior, posterior predictive and observed answers as netCDF groups.
+"""A material's results for ArviZ: posterior, posterior predictive and observed responses as netCDF groups.
 
 Groups and variables (dimensions chain, draw, participant, answer; of log_likelihood chain, draw, obs_id):
-    posterior             f: latent score at everybody's own trials, drawn from N(mode, K - K C K)
-    posterior_predictive  response: answers (categories from 0) that would be given there again
-    log_likelihood        response: log P(answer | f) of the answers alone, with participant and answer of each, since
-                          `arviz.loo` takes every element for an answer
-    observed_data         response: the answers, -1 where there is none
+
+    posterior             f: latent score at each participant's trials, drawn from N(mode, K - K C K)
+    posterior_predictive  response: predicted responses (categories from 0) at the same trials
+    log_likelihood        response: log P(response | f) without padding, with participant and answer of each, since
+                          `arviz.loo` counts every element as an observation
+    observed_data         response: the responses, -1 in unused slots
     constant_data         one variable for each parameter, in its unit; thresholds and noise of the likelihood; trial
-                          (and session) of each answer, as in the trial table
-`answer` counts everybody's fitted answers from 1. Voided, warm-up and repeated ones are not among them, so that it is
-not the trial number: the table's rows are found by `trial` and `session`. `arviz.from_netcdf` and
-`xarray.open_datatree` read the file. Everybody's posterior is their own: nothing is shared.
+                          (and session) of each response, as in the trial table
+
+`answer` counts each participant's fitted responses from 1. Voided, warm-up and repeated ones are not included, so that
+it is not the trial number: rows of the table are identified by `trial` and `session`. `arviz.from_netcdf` and
+`xarray.open_datatree` read the file. Each participant's posterior is separate, without pooling.
 """
 
 import os
@@ -40,7 +42,8 @@ _DIMS = ("chain", "draw", "participant", "answer")
 def groups(
     study: Study, cohort: Cohort, posteriors: Posterior, draws: int = 200, seed: int = 0
 ) -> dict[str, xr.Dataset]:
-    """The groups by name; `draws` independent draws, as one chain. Values where nobody answered are NaN or -1."""
+    """The groups as datasets, by name. `draws`: number of independent draws, as one chain, from `seed`. Unused slots
+    are NaN, -1 or ""."""
     keys = jax.random.split(jax.random.key(seed), len(cohort.names))
     f, response, log_likelihood = (np.moveaxis(np.asarray(leaf), 0, 1)[None] for leaf in _draw(posteriors, keys, draws))
     mask = np.asarray(cohort.trials.mask)
@@ -72,7 +75,7 @@ def groups(
 
 
 def _of(parameter: Parameter) -> dict[str, Any]:
-    """Attributes of a parameter's values: its unit; of levels what each number stands for."""
+    """netCDF attributes of a parameter: its unit, or for levels the meaning of each number."""
     if not parameter.levels:
         return {"units": parameter.unit}
     return {"levels": ", ".join(f"{k} = {level}" for k, level in enumerate(parameter.levels))}
@@ -81,7 +84,8 @@ def _of(parameter: Parameter) -> dict[str, Any]:
 def _of_answers(
     values: Float[np.ndarray, "1 draws M n"], mask: Bool[np.ndarray, "M n"], names: Sequence[str]
 ) -> xr.Dataset:
-    """The values where somebody answered, by person and then by answer."""
+    """The log-likelihoods of the used slots (`mask`) as a dataset with one dimension `obs_id`, by participant and then
+    by response."""
     person, answer = np.nonzero(mask)
     chain, draw, *_ = values.shape
     coords = {
@@ -95,9 +99,9 @@ def _of_answers(
 
 
 def inference_data(study: Study, cohort: Cohort, posteriors: Posterior, draws: int = 200, seed: int = 0) -> Any:
-    """The groups as ArviZ has them (`arviz.InferenceData`): what `arviz.from_netcdf` reads from inference.nc.
+    """The groups as an `arviz.InferenceData`, equal to `arviz.from_netcdf` of inference.nc.
 
-    `posteriors` are those of the cohort's people, stacked. Raises `InputError` for those of other people.
+    `posteriors`: of the cohort's participants, stacked. Raises `InputError` if their shape is not the cohort's.
     """
     import arviz
 
@@ -112,13 +116,13 @@ def inference_data(study: Study, cohort: Cohort, posteriors: Posterior, draws: i
 
 
 def write_groups(datasets: dict[str, xr.Dataset], path: str | os.PathLike) -> None:
-    """One netCDF file with a group for each part."""
+    """Write one netCDF file with a group per dataset; an existing file is overwritten."""
     for i, (name, data) in enumerate(datasets.items()):
         data.to_netcdf(path, mode="a" if i else "w", group=name, engine="h5netcdf")
 
 
 def predictive_shares(datasets: dict[str, xr.Dataset], categories: int) -> tuple[np.ndarray, np.ndarray]:
-    """Share of every category (C,) among the answers, and in each draw of them (draws, C)."""
+    """Proportion of each category in the observed responses (C,), and in each draw of predicted ones (draws, C)."""
     observed = datasets["observed_data"]["response"].values
     held = observed >= 0
     predicted = datasets["posterior_predictive"]["response"].values[0][:, held]
@@ -130,7 +134,8 @@ def predictive_shares(datasets: dict[str, xr.Dataset], categories: int) -> tuple
 def _draw(
     posteriors: Posterior, keys: Key[Array, " M"], draws: int
 ) -> tuple[Float[Array, "M draws n"], Int[Array, "M draws n"], Float[Array, "M draws n"]]:
-    """Latent scores, answers and log-likelihoods (M, draws, n)."""
+    """Draw latent scores, responses and log-likelihoods of the observed responses, each (M, draws, n), unused slots
+    included."""
 
     def one(person):
         posterior, key = person

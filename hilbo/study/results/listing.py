@@ -1,6 +1,6 @@
-"""The list that stands in every results folder, `.hilbo.json`: its files with their digests, and what made them.
+"""The list in every results folder, `.hilbo.json`: its files with their digests, and the command that made them.
 
-By it `--force` replaces what hilbo wrote and nothing else, and a withdrawal knows what is to be made again.
+From it `--force` knows which files hilbo wrote and may replace, and a withdrawal which results must be made again.
 """
 
 import hashlib
@@ -21,17 +21,17 @@ _COMMAND, _WHERE = "//command", "//folder"  # no file has such a name
 
 
 class Listed(NamedTuple):
-    """What a list says; empty for a folder that hilbo did not write."""
+    """Content of a list; empty for a folder that hilbo did not write."""
 
     files: dict[str, str]
     """Name within the folder -> SHA-256."""
     command: str = ""
     where: str = ""
-    """The folder in which the command was given."""
+    """Working directory of the command."""
 
 
 def listed(folder: Path) -> Listed:
-    """The list of a folder; an empty one where there is none, or none that can be read."""
+    """Read the list of a folder; an empty `Listed` if it is missing or unreadable."""
     try:
         entries = msgspec.json.decode((folder / LIST).read_bytes(), type=dict[str, str])
     except (OSError, *UNREADABLE):
@@ -41,19 +41,21 @@ def listed(folder: Path) -> Listed:
 
 
 def list_files(folder: Path, command: str = "", where: str = "") -> None:
-    """Write the list of all files that are in a folder now."""
+    """Write the list of all files that are now in a folder and below, with their digests; an existing list is
+    replaced."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in (LIST, LOCK))
     write_list(folder, Listed({path.relative_to(folder).as_posix(): digest(path) for path in files}, command, where))
 
 
 def write_list(folder: Path, content: Listed) -> None:
-    """Write a folder's list."""
+    """Write `content` as the folder's list; an existing list is replaced. `where` is saved only together with a
+    command."""
     made = content.files | ({_COMMAND: content.command, _WHERE: content.where} if content.command else {})
     rewrite_file(folder / LIST, json.dumps(made, indent=0, ensure_ascii=False))
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file; empty for what is none."""
+    """SHA-256 (hex) of a file's content; "" if there is no such file."""
     if not path.is_file():
         return ""
     with path.open("rb") as file:

@@ -1,7 +1,7 @@
-"""map.nc: the population map on a grid or at points, written with a digest of its numbers and read back checked.
+"""map.nc: the population map on a grid or at points, written with a digest of its content and checked when read.
 
-A grid where there are up to three continuous parameters, else points: feasible ones of low discrepancy, a fifth of them
-on walls, edges and corners, each with its values in physical units and the map's mean and variance there.
+A grid if there are at most three parameters, all continuous; otherwise points: feasible ones of low discrepancy, a
+fifth of them on walls, edges and corners, each with its values in physical units and the map's mean and variance there.
 """
 
 import hashlib
@@ -33,13 +33,16 @@ _WIDEST = 10.0  # prior variances that a map's variance may be
 
 
 def on_grid(space: SearchSpace) -> bool:
-    """Whether maps of a space are on a grid of all its parameters."""
+    """Whether maps of this space are stored on a grid (at most three parameters, all continuous), and not at points."""
     return space.dim <= 3 and not any(space.discrete)
 
 
 def map_dataset(study: Study, surface: Callable[..., Any], cells: int = CELLS) -> xr.Dataset:
-    """The population map on a grid of all dimensions, or at points where there is none (`on_grid`).
-    `surface`: points (m, d) of the unit cube -> mean and variance, (m,) each."""
+    """The population map as a dataset, on a grid with `cells` points per parameter, or at points (`on_grid`).
+
+    `surface`: function of points (m, d) of the unit cube that returns mean and variance, (m,) each. A grid also has
+    infeasible points, marked by the variable `feasible`.
+    """
     if not on_grid(study.space):
         return _map_at_points(study, surface)
     shown = parameters = study.space.parameters
@@ -69,7 +72,7 @@ def map_dataset(study: Study, surface: Callable[..., Any], cells: int = CELLS) -
 
 
 def _map_at_points(study: Study, surface: Callable[..., Any], seed: int = 0) -> xr.Dataset:
-    """The map at points that fill the feasible set. `surface`: points (m, d) of the unit cube -> mean and variance."""
+    """The map at points that fill the feasible set; levels by name. `surface`: as in `map_dataset`."""
     x = search_points(study.space, seed)
     mean, variance = (np.asarray(moment) for moment in surface(np.asarray(x)))
     physical = np.asarray(study.space.to_physical(x)).T.tolist()
@@ -89,13 +92,17 @@ def _map_at_points(study: Study, surface: Callable[..., Any], seed: int = 0) -> 
 
 
 def write_map(grid: xr.Dataset, path: str | os.PathLike) -> None:
-    """Write a map with the digest of its content."""
+    """Write a map as netCDF, with the digest of its content as an attribute; an existing file is overwritten."""
     grid.assign_attrs(digest=_digest(grid)).to_netcdf(path, engine="h5netcdf")
 
 
 def read_map(path: str | os.PathLike, study: Study) -> xr.Dataset:
-    """A map over all parameters of a study, on a grid or at points, its numbers checked; the coordinates of points are
-    physical numbers. Raises InputError."""
+    """Read a map of all parameters of this study, on a grid or at points; coordinates of points are physical numbers,
+    levels by index.
+
+    Raises InputError for an unreadable or changed file, another study's parameters or ranges, infeasible points, and
+    implausible numbers.
+    """
     try:
         Path(path).open("rb").close()
     except OSError as error:
@@ -121,11 +128,13 @@ def read_map(path: str | os.PathLike, study: Study) -> xr.Dataset:
 
 
 def _numbers(parameter: Parameter, values: np.ndarray) -> np.ndarray:
-    """A coordinate as physical numbers; NaN where it is none of the parameter's."""
+    """A coordinate as physical numbers, levels by index; NaN for values that are none."""
     return np.array([parameter.number(value) for value in values.tolist()], float)
 
 
 def _loaded(path: str | os.PathLike) -> xr.Dataset:
+    """Load a netCDF file into memory. Raises an exception of any type if it is damaged, and ValueError if a variable
+    has more than 10 million entries."""
     import h5py
 
     with warnings.catch_warnings():
@@ -141,7 +150,8 @@ def _loaded(path: str | os.PathLike) -> xr.Dataset:
 
 
 def _digest(grid: xr.Dataset) -> str:
-    """Of names, dimensions, numbers, units and attributes; the same before and after a file."""
+    """First 16 hex digits of the SHA-256 of names, dimensions, numbers and attributes; the same before writing and
+    after reading."""
     hashed = hashlib.sha256()
     for name in sorted(map(str, grid.variables)):
         variable = grid[name]
@@ -155,6 +165,11 @@ def _digest(grid: xr.Dataset) -> str:
 
 
 def _check_grid(path, study, axes, shape, *dims) -> None:
+    """Raise InputError unless the map is on a grid over the study's parameters and ranges.
+
+    `axes`: parameter -> its coordinate in physical units; `shape`: of the mean; `dims`: dimension names of mean and
+    variance.
+    """
     if len(shape) < study.space.dim:
         raise InputError(f"{path}: is a slice of a map of more dimensions; a warm start needs all of them.")
     whole = all(d == study.space.names for d in dims) and all(size > 1 for size in shape)
@@ -167,6 +182,8 @@ def _check_grid(path, study, axes, shape, *dims) -> None:
 
 
 def _check_points(path, study, axes, shape, *dims) -> None:
+    """Raise InputError unless the points have all parameters of the study and are feasible; arguments as for
+    `_check_grid`."""
     whole = all(d == ("point",) for d in dims) and set(axes) == set(study.space.names)
     for p in study.space.parameters if whole else ():
         whole = whole and axes[p.name].shape == shape and all(p.holds(value) for value in axes[p.name].tolist())
@@ -178,6 +195,8 @@ def _check_points(path, study, axes, shape, *dims) -> None:
 
 
 def _check_numbers(path, study, mean, variance) -> None:
+    """Raise InputError for means and variances (arrays of any shape) that are not finite, or implausible under the
+    study's prior."""
     prior = float(study.gp.kernel.variance)
     if not (np.isfinite(mean).all() and np.abs(mean).max() <= _FARTHEST * np.sqrt(prior)):
         raise InputError(f"{path}: the map's mean is no number, or far beyond the prior; aggregate the answers again.")
@@ -188,5 +207,5 @@ def _check_numbers(path, study, mean, variance) -> None:
 
 
 def _words(error: Exception) -> str:
-    """An error's text in one line."""
+    """An error's text in one line of at most 200 characters; the name of its type if it has none."""
     return " ".join(str(error).split())[:200] or type(error).__name__

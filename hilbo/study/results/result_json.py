@@ -1,4 +1,4 @@
-"""result.json of `hilbo aggregate` as another command reads it: typed, within the study's ranges, unchanged."""
+"""result.json of `hilbo aggregate` as read by other commands: parsed, and checked against the study and for changes."""
 
 import os
 from typing import Annotated
@@ -18,20 +18,20 @@ _WHAT = "is no result.json of hilbo; give the one that hilbo aggregate wrote"
 
 
 class FoundOptimum(msgspec.Struct, frozen=True):
-    """An optimum: parameter -> value in physical units, of levels their names."""
+    """An optimum: parameter -> value in physical units, levels by name."""
 
     parameters: dict[str, float | str | None]
 
 
 class FoundPerson(msgspec.Struct, frozen=True):
-    """A participant of the map, and their own optimum if one was sought."""
+    """A participant, and their individual optimum if one was computed."""
 
     participant: str
     optimum: FoundOptimum | None = None
 
 
 class Result(msgspec.Struct, frozen=True):
-    """What other commands take from a result."""
+    """The part of a result.json that other commands use."""
 
     study: str
     optimum: FoundOptimum
@@ -42,7 +42,9 @@ class Result(msgspec.Struct, frozen=True):
 
 
 def read_result(path: str | os.PathLike, study: Study) -> Result:
-    """A result.json of this study. Raises InputError."""
+    """Read and check the result.json of this study. Raises InputError for a file that cannot be read, was changed,
+    or is of another study, for no, invalid or repeated participants, and for optima that are out of range or not
+    passive."""
     source, content = str(path), read_bytes(path)
     result: Result = decoded(content, Result, source, _WHAT)
     unsealed(content, result.digest, source)
@@ -63,7 +65,7 @@ def read_result(path: str | os.PathLike, study: Study) -> Result:
 
 
 def _check_optima(study: Study, result: Result, source: str) -> None:
-    """Refuse optima outside the study's ranges, and such as would not be passive."""
+    """Raise InputError for an optimum outside the study's ranges, or one that is not passive on the study's device."""
     named = {"the optimum": result.optimum} | {
         f"the optimum of {person.participant}": person.optimum for person in result.participants if person.optimum
     }

@@ -1,4 +1,5 @@
-"""Flags of the device in tables of answers: which rows carry one, and how many do (`hilbo.study.file.trial_flags`)."""
+"""Flags of the device in trial and validation tables: rows that carry one, and their counts
+(`hilbo.study.file.trial_flags`)."""
 
 from collections import Counter
 from collections.abc import Collection, Iterable
@@ -10,19 +11,20 @@ from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES, FLAGS, FlagC
 __all__ = ["added", "counted_flags", "flag_counts", "flag_sentences_of", "flagged", "with_flag_counts"]
 
 _COUNTS = "hilbo flags"
-"""Of the attributes that pandas carries along with a table, the one that holds its `FlagCounts`."""
+"""Key of a DataFrame's attributes that holds its `FlagCounts`."""
 _NONE_RECORDED = ("", "0", "0.0", "nan", "none", "<na>")
 
 
 def flagged(table: pd.DataFrame, exclude: Collection[str]) -> pd.Series:
-    """Which rows carry one of these flags."""
+    """Boolean Series of the rows with at least one of the flags `exclude`; all False without a column of flags."""
     if COLUMN not in table or not exclude:
         return pd.Series(False, table.index)
     return _carried(table).map(lambda names: not names.isdisjoint(exclude)).astype(bool)
 
 
 def counted_flags(table: pd.DataFrame, exclude: Collection[str]) -> FlagCounts:
-    """The counts of the rows that an analysis would take if no flag were excluded; cells are texts."""
+    """Flag counts of these rows: with recorded telemetry, per flag, and excluded ones per participant. All 0 if the
+    table has neither column of the device. `exclude`: flags that exclude a row."""
     if COLUMN not in table and COLUMN_OF_SAMPLES not in table:
         return FlagCounts()
     carried = _carried(table)
@@ -35,18 +37,19 @@ def counted_flags(table: pd.DataFrame, exclude: Collection[str]) -> FlagCounts:
 
 
 def with_flag_counts(table: pd.DataFrame, counts: FlagCounts) -> pd.DataFrame:
-    """The table, which carries these counts along."""
+    """Store flag counts in the table's attributes (`DataFrame.attrs`, changed in place); returns the same table.
+    Inverse of `flag_counts`."""
     table.attrs[_COUNTS] = counts
     return table
 
 
 def flag_counts(*tables: pd.DataFrame) -> FlagCounts:
-    """The counts that tables of comparisons carry, together."""
+    """Sum of the flag counts that `with_flag_counts` stored in these tables; tables without count as 0."""
     return added(table.attrs.get(_COUNTS, FlagCounts()) for table in tables)
 
 
 def added(parts: Iterable[FlagCounts]) -> FlagCounts:
-    """The counts of several tables together."""
+    """Sum of several flag counts."""
     each = list(parts)
     total = sum((Counter(counts.flagged) for counts in each), Counter())
     flags = {name: total[name] for name in FLAGS if total[name]}
@@ -55,12 +58,13 @@ def added(parts: Iterable[FlagCounts]) -> FlagCounts:
 
 
 def flag_sentences_of(counts: FlagCounts, exclude: Collection[str], what: str = "trials") -> list[str]:
-    """The sentences of `flag_sentences`; nothing where no trial carries a flag and none is excluded."""
+    """As `flag_sentences`, but an empty list if no trial has a flag and the study excludes none. `what`: plural of what
+    is counted."""
     return flag_sentences(counts, exclude, what) if counts.flagged or exclude else []
 
 
 def _carried(table: pd.DataFrame) -> pd.Series:
-    """The flags of each row."""
+    """Set of known flags in each row; empty sets without a column of flags."""
     if COLUMN not in table:
         return pd.Series([frozenset()] * len(table), table.index, dtype=object)
     return table[COLUMN].map(lambda cell: frozenset(FLAGS).intersection(str(cell).split()))

@@ -1,4 +1,4 @@
-"""Sets tables: a CSV or Parquet file with one named parameter set in each row; the one reader of them.
+"""Sets tables: a CSV or Parquet file with one named parameter set in each row; all sets tables are read here.
 
 Columns: `set_id` (its name), the parameters, and optionally `source`, `role`, `material`, K0, N, T, memory, states,
 force_limit and others, which are kept as text. Units: K N/mm, B1 N·s^α/mm, T s, force N. Loads no JAX: `hilbo device`
@@ -20,7 +20,7 @@ from hilbo.study.formats.csv_rows import Rows, open_csv, say_delimiter
 __all__ = ["ROLES", "read_sets", "role_of", "source_kind", "source_of"]
 
 ROLES = ("best", "mid", "worst")
-"""What a set is in a validation, by the map that it was read from."""
+"""Roles of sets in a validation: points of the map from which they were read."""
 
 _NUMBERS = ("K0", "K1", "B1", "alpha", "force_limit")
 _WHOLE = ("N", "states")
@@ -33,10 +33,11 @@ def read_sets(
     needs: Sequence[str] = ("K1", "B1", "alpha"),
     levels: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> dict[str, dict[str, Any]]:
-    """Each set's name and values, in the order of the file; empty cells are left out.
+    """Read a sets table; returns set name -> column -> value, in the order of the file, without empty cells.
 
-    `needs`: columns that every set has a value in, beside `set_id`; of these all but `source` are numbers, or one of
-    their `levels`. Raises `InputError`, one sentence with file and line.
+    `needs`: columns in which every set must have a value, besides `set_id`; all of them but `source` are numbers, or
+    one of the `levels` (column -> names). Values are numbers, whole numbers or text by their column. Raises
+    `InputError`, one sentence with file and line.
     """
     source = str(path)
     columns, rows, comma = _table(Path(path))
@@ -69,21 +70,23 @@ def read_sets(
 
 
 def source_kind(text: str) -> str | None:
-    """Which kind of source this names: aggregate, sysid, individual, or None."""
+    """Kind of a set's source: "aggregate", "sysid", or "individual" for `individual:PARTICIPANT`; None for other
+    text."""
     if text in ("aggregate", "sysid"):
         return text
     return "individual" if text.startswith(_INDIVIDUAL) and len(text) > len(_INDIVIDUAL) else None
 
 
 def role_of(name: str) -> str:
-    """The role in a set's name as plans give it, `[MATERIAL ][PARTICIPANT ]ROLE`; empty where it names none."""
+    """Role (best, mid, worst) at the end of a set's name, which plans form as `[MATERIAL ][PARTICIPANT ]ROLE`; "" if
+    there is none."""
     last = name.rpartition(" ")[2]
     return last if last in ROLES else ""
 
 
 def source_of(name: str, material: str | None = None) -> str:
-    """The source in a set's name as plans give it: with a role its participant's or the population's map, else
-    `[MATERIAL ]aggregate` or `[MATERIAL ]individual:PARTICIPANT`. The population's where the name says none."""
+    """Source of a set, "aggregate" or "individual:PARTICIPANT", from its name as plans form it: `[MATERIAL
+    ][PARTICIPANT ]ROLE`, or `[MATERIAL ]SOURCE` (which may be "sysid"). "aggregate" for any other name."""
     rest = name.removeprefix(f"{material} ") if material else name
     before, _, last = rest.rpartition(" ")
     if last in ROLES:
@@ -92,7 +95,8 @@ def source_of(name: str, material: str | None = None) -> str:
 
 
 def _table(path: Path, needs: str = "a sets table needs a header and a parameter set") -> tuple[list[str], Rows, bool]:
-    """Column names, each row's line and cells as text, and whether a comma may be the decimal point."""
+    """Read a file; returns column names, rows (line number, text cells), and whether a comma may be the decimal point.
+    Warns about the separator if it is not a comma. Raises `InputError`."""
     if path.suffix == ".parquet":
         from hilbo.study.formats.csv_file import read_cells
 
@@ -106,7 +110,8 @@ def _table(path: Path, needs: str = "a sets table needs a header and a parameter
 def _value(
     column: str, text: str, needs: Sequence[str], levels: Mapping[str, Sequence[str]], place: str, comma: bool
 ) -> Any:
-    """A cell as what its column holds: a number, a whole number, or text."""
+    """Convert a cell to the type of its column: level, source, whole number (N, states), number or text. `place`: file
+    and line. Raises `InputError`."""
     if column in levels:
         if text not in levels[column]:
             raise InputError(f'{place}: {column} is "{text}"; it must be one of {", ".join(levels[column])}.')

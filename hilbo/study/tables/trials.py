@@ -1,11 +1,11 @@
-"""Trial tables: CSV or Parquet, one row per answer, checked before anything is fitted.
+"""Trial tables: CSV or Parquet, one row per response, checked before any fit.
 
 Columns: `participant`, `trial`, `response` and one per parameter in physical units; optional `session`, `phase`,
-`material`, `voided`, `unblinded`, `flags`, `telemetry_samples`; others are kept. A number means what its decimals say
-(correctly rounded), so that a table and the log it came from give the same bits. People come in the order of their
-names, whatever the order of the rows: the last digits of sums, and where a search ends, depend on it. Whatever is wrong
-is one sentence with the file and the line (Parquet: row). A table is read piece by piece, and a piece's text is gone
-when its numbers are known.
+`material`, `voided`, `unblinded`, `flags`, `telemetry_samples`; others are kept. Numbers are correctly rounded from
+their decimals, so that a table and the log it came from give the same bits. Participants are sorted by name, whatever
+the order of the rows: the last digits of sums, and where a search ends, depend on the order. Every mistake is one
+sentence with the file and the line (Parquet: row). A table is read piece by piece, and a piece's text is discarded once
+its numbers are parsed.
 """
 
 import os
@@ -48,11 +48,11 @@ __all__ = [
 
 
 class NothingToFitError(InputError):
-    """A table that is in order, and has no answer that counts."""
+    """A valid table, none of whose responses is fitted."""
 
 
 NOT_FITTED = ("warm-up", "repeat")
-"""Phases whose answers are kept and never fitted: familiarisation, and repetitions that check consistency."""
+"""Phases whose responses are kept but never fitted: familiarisation, and repetitions for test-retest agreement."""
 _KEY = ("participant", "session", "phase", "material", "trial")
 _TRUE = {"1", "1.0", "1,0", "true", "yes"}
 _NAMED = 6  # people of whom a remark says the names
@@ -61,12 +61,12 @@ _FALSE = {"", "0", "0.0", "0,0", "false", "no", "nan", "none", "<na>"}
 
 
 class TrialTable(NamedTuple):
-    """A trial table that was checked against a study: the rows to be fitted, by participant, session and trial."""
+    """A checked trial table: the rows to be fitted, sorted by participant, session and trial."""
 
     rows: pd.DataFrame
-    """With the column `category` (0 = lowest response); of a level its place in the list."""
+    """The rows to be fitted, with the column `category` (0 = lowest response) and levels by their index."""
     flags: FlagCounts
-    """Trials that carry a flag of the device, and those that the study excludes for theirs."""
+    """Counts of trials with a flag of the device, and of those excluded for it."""
 
 
 def trial_table(
@@ -79,13 +79,14 @@ def trial_table(
     say: Callable[[int], object] = lambda rows: None,
     note: Callable[[str], object] = warn_caller,
 ) -> TrialTable:
-    """The checked table of these cells, which come as text, piece by piece (`csv_file.cell_pieces`, `cells_of`).
+    """Check the text cells of a trial table, given in pieces (`csv_file.cell_pieces`, or a list with `cells_of`).
 
     Warm-up, repeated and voided rows, and those with a flag that the study excludes, are checked and left out.
 
-    **Arguments:** `material`: only its rows; needed if there are several. `source`: the file, for sentences. `others`:
-    keep the columns that hilbo does not use. `say`: called with the number of rows read so far. `note`: called with a
-    sentence on participants without a response that counts; by default a warning. Raises `InputError`.
+    **Arguments:** `material`: select its rows; required if there are several. `source`: the file, for messages.
+    `others`: keep the columns that hilbo does not use. `say`: called with the number of rows read so far. `note`:
+    called with one sentence on participants none of whose responses is fitted, and one on ids that differ in capitals
+    only; by default a warning. Raises `InputError`, and its subclass `NothingToFitError` if no row is left.
     """
     texts, pieces, rows, named = {}, [], 0, {}
     for text in cells:
@@ -118,14 +119,15 @@ def trial_table(
 
 
 def joined(tables: Sequence[TrialTable]) -> TrialTable:
-    """Several tables of one study as one."""
+    """Several checked tables of one study as one, sorted again; flag counts are added. Duplicates are not looked
+    for."""
     rows = pd.concat([table.rows for table in tables], ignore_index=True)
     return TrialTable(_ordered(rows), added(table.flags for table in tables))
 
 
 def _ordered(table: pd.DataFrame) -> pd.DataFrame:
-    """A checked table, or several as one, by participant, session and trial; where a session has a number in several
-    phases, by phase before."""
+    """Rows sorted by participant, session and trial; by phase before trial if a session has a trial number in several
+    phases."""
     keys = [name for name in ("participant", "session") if name in table]
     if "phase" in table and table.duplicated([*keys, "trial"]).any():
         keys.append("phase")
@@ -136,7 +138,8 @@ def _ordered(table: pd.DataFrame) -> pd.DataFrame:
 def _note_the_absent(
     left: pd.DataFrame, table: pd.DataFrame, source: str, besides: str, note: Callable[[str], object]
 ) -> None:
-    """Say who has answers, and none that counts: without a word that person would be missing everywhere."""
+    """Call `note` with one sentence on participants who occur in `left` (excluded rows) but not in `table` (fitted
+    rows); no call if there are none. `besides`: further reason for exclusion, for the sentence."""
     kept = set(table["participant"].unique())
     absent = [str(name) for name in left["participant"].unique() if name not in kept]
     if absent:
@@ -148,7 +151,12 @@ def _note_the_absent(
 
 
 def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
-    """A piece with its numbers as numbers and its texts as one object each, and `_fitted`: which rows count."""
+    """Check one piece of text cells; returns it with `trial` and parameters as numbers, and the new columns `category`,
+    `_blinded` and `_fitted` (Boolean: whether the row is to be fitted).
+
+    `texts` is a cache in which equal texts become one object; it is extended. `others`: keep columns that hilbo does
+    not use. Raises `InputError`.
+    """
     numeric = {"trial", *study.space.names}
     names: list[str] = list(text.columns)
     table: dict[str, object] = {}  # a frame at once: each column that is added to one costs as many as there are
@@ -171,9 +179,8 @@ def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, te
 
 
 def _numbered(names: pd.Series) -> pd.Series:
-    """Of people, sessions or phases the place of each row's in their order: by numbers where all are numbers, else by
-    the alphabet, in which S2 is before S10. What is computed of a table then does not depend on the order of its rows.
-    """
+    """Rank (from 0) of each row's name in the sorted names: numerically if all are numbers, otherwise alphabetically
+    with runs of digits compared as numbers, so that S2 comes before S10."""
     known = pd.Series(names.unique())
     numbers = pd.to_numeric(known, errors="coerce")
     padded = known.map(lambda name: re.sub(r"\d+", lambda digits: digits[0].zfill(20), str(name)))
@@ -183,7 +190,8 @@ def _numbered(names: pd.Series) -> pd.Series:
 
 
 def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:
-    """Write a trial table, numbers as the shortest decimals that read back to the same bits."""
+    """Write a trial table as Parquet (by its suffix) or CSV, without its index; an existing file is overwritten.
+    Numbers of a CSV are the shortest decimals that read back to the same bits."""
     if Path(path).suffix == ".parquet":
         table.to_parquet(path, index=False)
     else:
@@ -191,6 +199,8 @@ def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:
 
 
 def _check_columns(text: pd.DataFrame, study: StudyFile, source: str) -> None:
+    """Raise InputError for the first required column that is missing; the message names a column that differs in
+    capitals or blanks only."""
     needed = ("participant", "trial", "response", *study.space.names)
     missing = [name for name in needed if name not in text.columns]
     if missing:
@@ -203,7 +213,8 @@ def _check_columns(text: pd.DataFrame, study: StudyFile, source: str) -> None:
 
 
 def _check_random_effect(text: pd.DataFrame, study: StudyFile, source: str) -> None:
-    """Refuse rows that leave the column of the study's random effect empty, where there is one."""
+    """Raise InputError for a row whose cell in the random effect's column is empty; a table without that column
+    passes."""
     name = study.random_effect
     if name in text.columns:
         missing = text[name].str.strip().str.lower().isin(_MISSING)
@@ -211,7 +222,8 @@ def _check_random_effect(text: pd.DataFrame, study: StudyFile, source: str) -> N
 
 
 def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.Series:
-    """Categories from 0."""
+    """Category of each response, an integer from 0 (lowest). Raises InputError for a cell that is no label, nor rank
+    where ranks are accepted."""
     forms, ranks = answer_forms(responses)
     categories = cells.map(forms)
     allowed = ", ".join(responses) + (ranks and f", or {ranks}")
@@ -220,8 +232,8 @@ def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.S
 
 
 def check_recoding(text: pd.DataFrame, responses: Sequence[str]) -> None:
-    """Refuse cells in which `category` is not that of `response`: only one of them was changed by whoever read them,
-    and the fit would be to the other."""
+    """Raise InputError for a row whose `category` does not belong to its `response`: a user has changed one of the two,
+    and the fit would use the other."""
     categories = _categories(text["response"], responses, FRAME)
     refuse(
         pd.to_numeric(text["category"], errors="coerce") != categories,
@@ -234,13 +246,15 @@ def check_recoding(text: pd.DataFrame, responses: Sequence[str]) -> None:
 
 
 def is_fitted(phases: pd.Series) -> pd.Series:
-    """Whether answers of these phases are fitted, however somebody writes "warm-up": "Warm up" is one too."""
+    """Boolean Series: False for warm-up and repeat phases, in any spelling with capitals, blanks, "-" or "_", such as
+    "Warm up"."""
     plain = phases.str.lower().str.replace(r"[\s_-]", "", regex=True)
     return ~plain.isin([phase.replace("-", "") for phase in NOT_FITTED])
 
 
 def flags(text: pd.DataFrame, column: str, source: str) -> pd.Series:
-    """A column of 1 and 0; all 0 where there is none."""
+    """A column of 1/0, true/false or yes/no as a Boolean Series; empty cells are False, and so are all rows if there is
+    no such column. Raises InputError for other text."""
     if column not in text:
         return pd.Series(False, text.index)
     cells = text[column].str.strip().str.lower()
@@ -249,7 +263,8 @@ def flags(text: pd.DataFrame, column: str, source: str) -> pd.Series:
 
 
 def _check_blinded(blinded: pd.Series, study: StudyFile, source: str) -> None:
-    """Refuse answers of people who knew the parameters beside answers of people who did not."""
+    """Raise InputError if blinded and unblinded responses are mixed, except in a study with [stimulus] unblinded.
+    `blinded`: Boolean, by row."""
     expected = study.stimulus is not None and study.stimulus.unblinded
     if not expected and blinded.any() and not blinded.all():
         row = (~blinded).idxmax()
@@ -260,6 +275,8 @@ def _check_blinded(blinded: pd.Series, study: StudyFile, source: str) -> None:
 
 
 def _check_duplicates(table: pd.DataFrame, source: str) -> None:
+    """Raise InputError for two rows with the same participant, session, phase, material and trial (of these, the
+    columns that the table has)."""
     key = [column for column in _KEY if column in table]
     again = table.duplicated(key)
     if again.any():
@@ -273,10 +290,8 @@ def _check_duplicates(table: pd.DataFrame, source: str) -> None:
 
 
 def of_material(table: pd.DataFrame, material: str | None, source: str) -> pd.DataFrame:
-    """The rows of one material; which one must be said where there are several.
-
-    Raises `InputError` if it is not said, or is not there.
-    """
+    """Rows of one material; all rows for None. Raises `InputError` for None with several materials, and for a material
+    that is not in the table."""
     if "material" not in table:
         if material is not None:
             raise InputError(f'{place(source)}column "material" is missing; without it no material can be chosen.')
@@ -292,14 +307,15 @@ def of_material(table: pd.DataFrame, material: str | None, source: str) -> pd.Da
 
 
 def check_people(text: pd.DataFrame, source: str) -> None:
-    """Refuse rows without a participant, and ids against the rule for them."""
+    """Raise `InputError` for a row without a participant, or with an invalid id."""
     cells = text["participant"]
     refuse(cells == "", source, lambda row: "participant is empty; give each row a participant.")
     refuse(cells.isin(no_ids(cells)), source, lambda row: f'participant is "{cells.at[row]}"; {ID_WORDS}.')
 
 
 def check_texts(text: pd.DataFrame, source: str, numeric: Collection[str] = ()) -> None:
-    """Refuse cells, and heads of columns, that a spreadsheet would run; `numeric`: columns that hold no text."""
+    """Raise `InputError` for a cell or column name that a spreadsheet could run as a formula; the cells of the columns
+    `numeric` are not checked."""
     for column in text.columns:  # in memory a name may be a number
         check_text(str(column), "the name of a column", place(source).rstrip(": "))
         if column not in numeric:

@@ -1,11 +1,13 @@
-"""Validation tables, one row per comparison of two parameter sets, and sets tables, one row per set; read and checked.
+"""Validation tables, one row per comparison of two parameter sets, and sets tables, one row per set: reading and
+checks.
 
 Validation: `participant, trial, set_a, set_b, class_a, class_b, preferred`, optional `material, session, first`; others
 are kept. `class_a`, `class_b` are labels of the study's responses (or ranks from 1, if no label reads as an integer),
 `preferred` and `first` one of the two sets, or "a" or "b"; `preferred` may be "tie". Rows whose `voided` is 1, or whose
-`phase` is warm-up or repeat, are left out. What was not asked is empty.
-Sets: `set_id, source` (aggregate, sysid or individual:PARTICIPANT), and the parameters that the caller names.
-Whatever is wrong is one sentence with the file and the line.
+`phase` is warm-up or repeat, are left out. Questions that were not asked are empty cells.
+
+Sets: `set_id, source` (aggregate, sysid or individual:PARTICIPANT), and the parameters that the caller names. Every
+mistake is one sentence with the file and the line.
 """
 
 import os
@@ -25,7 +27,7 @@ __all__ = ["NONE", "RESPONSES", "TIE", "check_validation", "of_material", "read_
 RESPONSES = ("different", "similar", "close")
 TIE = "tie"
 NONE = ""
-"""What stands where nothing was asked."""
+"""Cell of a question that was not asked."""
 
 _NEEDED = ("participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred")
 _OPTIONAL = ("material", "session", "first")
@@ -39,10 +41,11 @@ def read_validation(
     material: str | None = None,
     exclude_flags: Collection[str] = (),
 ) -> pd.DataFrame:
-    """The comparisons of one material; `responses` are the study's, lowest first. Raises `InputError`.
+    """Read and check the comparisons of one material; None if the table has at most one. `responses`: the study's
+    labels, lowest first.
 
-    Rows with one of `exclude_flags` are excluded.
-    All cells are text but `trial`; classes are labels, `preferred` and `first` names of sets (or "tie"), or empty.
+    All columns are text but `trial`; classes are labels, `preferred` and `first` names of sets (or "tie"), or empty.
+    Rows with one of `exclude_flags` are left out. Raises `InputError`.
     """
     text = read_cells(path, "a validation table needs a header and a comparison")
     if "material" in text:
@@ -56,10 +59,11 @@ def check_validation(
     source: str = "validation table",
     exclude_flags: Collection[str] = (),
 ) -> pd.DataFrame:
-    """Check a table however it was made, and bring it into the form that `read_validation` gives.
+    """Check a validation table in memory and convert it to the form of `read_validation`.
 
-    Rows with one of `exclude_flags` are left out; the table carries their counts (`flag_counts.flag_counts`).
-    Raises `InputError` for a missing column, a table without rows, and values that cannot be.
+    Warm-up, repeated and voided rows, and those with one of `exclude_flags`, are checked and left out; flag counts are
+    stored in the result (`flag_counts.flag_counts`). Raises `InputError` for a missing column, an invalid value, a
+    duplicate, and a table without a comparison that is left.
     """
     _check_columns(table, source)
     text = _as_text(table)
@@ -87,7 +91,7 @@ def check_validation(
 
 
 def _check_columns(table: pd.DataFrame, source: str) -> None:
-    """Refuse a table that lacks a column, or has no rows."""
+    """Raise InputError for a missing column, or a table without rows."""
     missing = [name for name in _NEEDED if name not in table.columns]
     if missing:
         raise InputError(
@@ -99,7 +103,8 @@ def _check_columns(table: pd.DataFrame, source: str) -> None:
 
 
 def _as_text(table: pd.DataFrame) -> pd.DataFrame:
-    """The table with its own columns as text without blanks around it, empty where nothing is."""
+    """Copy of the table in which the columns that hilbo uses are text without surrounding blanks, "" for missing
+    values."""
     text = table.copy()
     for column in (*_NEEDED, *(name for name in (*_OPTIONAL, "voided", "phase") if name in text)):
         cells = ["" if pd.isna(cell) else str(cell).strip() for cell in text[column]]
@@ -108,7 +113,7 @@ def _as_text(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _check_sets(text: pd.DataFrame, source: str) -> None:
-    """Refuse comparisons of anything but two sets with names of their own."""
+    """Raise InputError for a comparison with an empty or reserved set name (a, b, tie), or of a set with itself."""
     for column in ("set_a", "set_b"):
         refuse(text[column] == "", source, lambda row, c=column: f"{c} is empty; every comparison has one.")
     for column in ("set_a", "set_b"):
@@ -124,10 +129,8 @@ def _check_sets(text: pd.DataFrame, source: str) -> None:
 
 
 def of_material(table: pd.DataFrame, material: str | None, source: str = "validation table") -> pd.DataFrame:
-    """The rows of one material, which must be named if there are several.
-
-    Raises `InputError` if it is not said, or is not there.
-    """
+    """Rows of one material; all rows for None. Raises `InputError` for None with several materials, and for a material
+    that is not in the table."""
     materials = list(table["material"].unique()) if "material" in table else []
     if material is None:
         if len(materials) > 1:
@@ -144,9 +147,12 @@ def of_material(table: pd.DataFrame, material: str | None, source: str = "valida
 def sets_frame(
     path: str | os.PathLike, names: Sequence[str] = (), parameters: Sequence[Parameter] = ()
 ) -> pd.DataFrame:
-    """A sets table (`parameter_sets.read_sets`) whose sets say where they are from, indexed by `set_id`. `names`:
-    columns of numbers; `parameters`: those among them that may be levels, whose names become their places in the
-    list."""
+    """Read a sets table (`parameter_sets.read_sets`) in which `source` is required; returns it indexed by `set_id`,
+    missing texts as "".
+
+    `names`: required columns of numbers; `parameters`: those of them with levels have names of levels in the file, and
+    indices of levels in the result. Raises `InputError`.
+    """
     chosen = [p for p in parameters if p.levels]
     sets = read_sets(path, ("source", *names), {p.name: p.levels for p in chosen})
     frame = pd.DataFrame.from_dict(sets, orient="index").rename_axis("set_id")
@@ -157,7 +163,8 @@ def sets_frame(
 
 
 def _classes(text: pd.DataFrame, column: str, responses: Sequence[str], source: str) -> pd.Series:
-    """Labels of the responses, from labels or ranks; `NONE` where nothing was asked."""
+    """Labels of the responses in a column of labels or ranks; "" where nothing was asked. Raises InputError for other
+    text."""
     forms, ranks = answer_forms(responses)
     labels = text[column].map({form: responses[i] for form, i in forms.items()} | {"": NONE})
     allowed = ", ".join(responses) + (ranks and f", {ranks}") + ", or empty"
@@ -166,7 +173,8 @@ def _classes(text: pd.DataFrame, column: str, responses: Sequence[str], source: 
 
 
 def _chosen(text: pd.DataFrame, column: str, others: tuple[str, ...], source: str) -> pd.Series:
-    """One of the two sets by its name or as "a" or "b", or one of `others`."""
+    """The column with "a" and "b" replaced by the row's set names. Raises InputError for a cell that is neither of the
+    two sets, nor empty, nor one of `others`."""
     cells = text[column].mask(text[column] == "a", text["set_a"]).mask(text[column] == "b", text["set_b"])
     good = (cells == text["set_a"]) | (cells == text["set_b"]) | cells.isin((NONE, *others))
     allowed = "".join(f", {other}" for other in others)
@@ -182,6 +190,8 @@ def _chosen(text: pd.DataFrame, column: str, others: tuple[str, ...], source: st
 
 
 def _check_duplicates(table: pd.DataFrame, source: str) -> None:
+    """Raise InputError for two rows with the same participant, material, session and trial (of these, the columns that
+    the table has)."""
     key = [column for column in _KEY if column in table]
     again = table.duplicated(key)
     refuse(
