@@ -28,7 +28,7 @@ from hilbo.search.apart import differences, nrmse
 from hilbo.search.rendering import K0_range, Rendering
 from hilbo.study.analysis.cohort_results import CohortResults
 from hilbo.study.analysis.effects import effects_of
-from hilbo.study.analysis.heterogeneity import heterogeneity, in_place, rule_warnings
+from hilbo.study.analysis.heterogeneity import heterogeneity, how_aggregated, rule_warnings
 from hilbo.study.analysis.model_check import check_sentences
 from hilbo.study.analysis.region import Region, region_content, region_sentences
 from hilbo.study.config import Study
@@ -277,7 +277,7 @@ def write_results(
     say("figures and report")
     figures, shown = _figures(population, truth, grid)
     pictures = save_figures(figures, folder) | (pictures or {})
-    how = in_place(aggregate.map)
+    how = how_aggregated(aggregate.map)
     page = results_page(study, content, pictures, people, selection=selection, comparison=comparison, how=how, **shown)
     (folder / "report.html").write_text(page, encoding="utf-8")
     return content

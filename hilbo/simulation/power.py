@@ -77,10 +77,10 @@ def simulate_power(
 ) -> pd.DataFrame:
     """Errors of every study at every (m, t): columns `study`, `participants`, `trials`, `optimum`, `map`.
 
-    `jobs`: processes, by default as many as there are cores; each is a new one, also if there is only one, and calls
-    `begin` first (float64, a cache), else it computes with JAX's defaults. So a script needs `if __name__ ==
-    "__main__":`. `say` receives the number of finished studies. Raises `InputError` for numbers of participants or
-    responses that the study's rule cannot aggregate.
+    `jobs`: number of processes, by default that of the cores. All are new processes, even a single one, so that a
+    script must guard its main part with `if __name__ == "__main__":`. Each calls `begin` first (float64, a cache), if
+    given; otherwise it computes with JAX's defaults. `say` receives the number of finished studies. Raises `InputError`
+    for numbers of participants or responses that the study's method cannot aggregate.
     """
     _check_rule(study.rule, plan)
     jobs = min(cores() if jobs is None else jobs, plan.studies)

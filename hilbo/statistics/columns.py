@@ -46,9 +46,9 @@ def is_yes_or_no(values: np.ndarray) -> bool:
 
 
 def predictors_of(given: Columns | None, n: int) -> tuple[list[str], Float[np.ndarray, "n p"]]:
-    """Names and columns (n, p) of the predictors.
+    """Names and columns (n, p) of the predictors; none for None.
 
-    Raises `InputError` for values that are not finite, and wrong lengths.
+    Raises `InputError` for objects without names, values that are not finite numbers, and wrong lengths.
     """
     columns = {name: _numbers(values) for name, values in _columns("predictors", given).items()}
     for name, values in columns.items():
@@ -58,9 +58,9 @@ def predictors_of(given: Columns | None, n: int) -> tuple[list[str], Float[np.nd
 
 
 def labels_of(given: Columns | None, n: int) -> dict[str, Int[np.ndarray, " n"]]:
-    """Cluster index of every response, by clustering variable.
+    """Cluster index (from 0, in sorted order) of every response, by clustering variable; an empty dict for None.
 
-    Raises `InputError` for more than two variables and bad columns.
+    Raises `InputError` for objects without names, more than two variables, wrong lengths and missing values.
     """
     columns = {name: np.asarray(values) for name, values in _columns("clusters", given).items()}
     if len(columns) > 2:

@@ -146,7 +146,7 @@ def cohort_of(table: TrialTable | pd.DataFrame, study: Study, capacity: int | No
     held = np.arange(capacity)[None, :] < counts[:, None]
     middle = [p.middle for p in study.space.parameters]
     x = _to_unit(study.space, np.where(held[..., None], physical, middle))
-    asked = _asked(answers.iloc[order], rows, held.shape)
+    asked = _numbers_and_sessions(answers.iloc[order], rows, held.shape)
     texts = _random_effect(answers, study)
     if texts is None:
         return Cohort(jax.vmap(Trials)(x, to_device(categories), to_device(held)), physical, tuple(names), (), *asked)
@@ -157,7 +157,7 @@ def cohort_of(table: TrialTable | pd.DataFrame, study: Study, capacity: int | No
     return Cohort(trials, physical, tuple(names), tuple(contexts), *asked)
 
 
-def _asked(
+def _numbers_and_sessions(
     table: pd.DataFrame, rows: tuple[np.ndarray, np.ndarray], shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
     """Arrays of trial numbers and session indices, both of `shape` (0 in unused slots), and the session names in index

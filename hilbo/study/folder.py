@@ -282,10 +282,10 @@ def _departures(folder: Path, study: Study, materials: list[Material]) -> tuple[
         answers = Counter(dict(zip(material.cohort.names, material.cohort.counts().tolist(), strict=True)))
         for name, count in (answers + Counter(material.flags.excluded)).items():
             counts.setdefault(name, []).append(count)
-    return departures(read_plan(path), study.file.hash, study.file.selection.trials, counts, _held(folder))
+    return departures(read_plan(path), study.file.hash, study.file.selection.trials, counts, _session_plans(folder))
 
 
-def _held(folder: Path) -> list[Held] | None:
+def _session_plans(folder: Path) -> list[Held] | None:
     """Sessions of the optimisation phase with the plan that each followed, read from an export's data/; None if there
     is no table of sessions. Raises InputError."""
     paths = sorted((folder / "data").glob("*_table-sessions_data.csv"))

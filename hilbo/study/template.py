@@ -85,13 +85,13 @@ def study_text(new: NewStudy) -> str:
     except UNREADABLE as error:
         raise InputError(f"a name or an answer has what no file can hold ({error}); leave it out.") from error
     try:
-        checked(file, "", _computed if constraints else _checked)
+        checked(file, "", _build if constraints else _accept)
     except InputError as error:
         raise InputError(_as_written(str(error), new.constraints)) from None
     return text
 
 
-def _computed(file: StudyFile) -> None:
+def _build(file: StudyFile) -> None:
     """Build the study, to raise InputError if the constraints leave no feasible point."""
     from hilbo.study.config import Study  # loads what computes, which a file without constraints does not need
 
@@ -123,7 +123,7 @@ def _noted(text: str, comment: str) -> str:
     return f"{text:<36} # {comment}"
 
 
-def _checked(_file: StudyFile) -> None:
+def _accept(_file: StudyFile) -> None:
     """Accept any file: `reading.checked` has done the checks that need no model."""
 
 

@@ -23,7 +23,7 @@ from hilbo.report.figures import regions
 from hilbo.report.figures import study as plotting_study
 from hilbo.report.figures.maps import Slice
 from hilbo.study.analysis import analysis
-from hilbo.study.analysis.heterogeneity import in_place
+from hilbo.study.analysis.heterogeneity import how_aggregated
 from hilbo.study.analysis.progress import _map_by_points
 from hilbo.study.analysis.tolerance_intervals import _dominant_in_draws
 from hilbo.study.cohort import Cohort
@@ -91,14 +91,14 @@ def test_draws_of_tolerance_intervals_are_a_new_persons(posteriors):
 def test_what_stands_in_place_of_a_map_is_said(posteriors):
     """Of a rule that takes all answers at once, maps of fewer trials and of other people are merged otherwise."""
     for rule in ("bcm", "average", "hierarchical"):
-        assert in_place(of_rule(rule, posteriors[True])) == "" and not list(
+        assert how_aggregated(of_rule(rule, posteriors[True])) == "" and not list(
             analysis._aggregated_otherwise(of_rule(rule, None))
         )
     one = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[0]), posteriors[True])  # any posterior will do
     for rule, how in (("hierarchical", "by the rule hierarchical point by point"), ("pooled", "by bcm")):
         whole = RuleMap(rule, "exact", None, one, jnp.asarray(SHARE), jnp.asarray(1.0))
         (words,) = analysis._aggregated_otherwise(whole)
-        assert in_place(whole) == how and f"are aggregated {how}" in words and f"by the rule {rule} from" in words
+        assert how_aggregated(whole) == how and f"are aggregated {how}" in words and f"by the rule {rule} from" in words
     share = jnp.asarray(SHARE)
     assert point_rule("hierarchical", share) == ("hierarchical", share)
     assert point_rule("bcm", share) == ("bcm", None) and point_rule("pooled", share) == ("bcm", None)

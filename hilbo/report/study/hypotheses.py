@@ -19,7 +19,7 @@ import numpy as np
 from hilbo.report.results import misses
 from hilbo.report.validation import Validated, safest
 from hilbo.study.analysis.analysis import Analysis
-from hilbo.study.analysis.heterogeneity import in_place
+from hilbo.study.analysis.heterogeneity import how_aggregated
 
 __all__ = ["Evidence", "Hypothesis", "Results", "hypotheses"]
 
@@ -193,7 +193,7 @@ def _convergence(results):
     if len(progress.counts) <= 2 or not progress.splits:
         yield Evidence("inconclusive", "It takes several participants and trials to say.")
         return
-    how = in_place(analysis.aggregate.map)
+    how = how_aggregated(analysis.aggregate.map)
     how = f" (aggregated {how})" if how else ""
     row = _early(progress.counts)
     half, end, individual = (

@@ -26,7 +26,7 @@ from hilbo.report.study.result_tables import alternatives_table, convergence_tab
 from hilbo.report.study.study_figures import comparison_figures, study_figures
 from hilbo.report.validation import Validated, folder_names, named_warnings, validate
 from hilbo.study.analysis.analysis import Analysis, analyse, moved_by_evidence
-from hilbo.study.analysis.heterogeneity import in_place
+from hilbo.study.analysis.heterogeneity import how_aggregated
 from hilbo.study.config import Study
 from hilbo.study.file.trial_flags import flag_sentences
 from hilbo.study.folder import Material, StudyFolder
@@ -192,7 +192,7 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "figures": pictures,
         "typical": analysis.cohort.names[typical_person(analysis)],
         "unknown": UNKNOWN,
-        "how": in_place(analysis.aggregate.map),
+        "how": how_aggregated(analysis.aggregate.map),
         "reference": None if material.reference is None else material.reference_name,
         "table_1": _with_units(analysis.study, tables["table_I"]),
         "alternatives": _alternatives(analysis.study, tables["alternatives"]),

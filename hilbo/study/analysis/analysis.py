@@ -22,7 +22,7 @@ from hilbo.population.rules.registry import DEFAULT, RECOMMENDED, RULES
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.analysis.cohort_results import CohortResults, Say, analyse_cohort
-from hilbo.study.analysis.heterogeneity import in_place
+from hilbo.study.analysis.heterogeneity import how_aggregated
 from hilbo.study.analysis.progress import Progress
 from hilbo.study.analysis.rule_comparison import FEWEST, compare
 from hilbo.study.analysis.tolerance import Sets, Tolerance, best_mid_worst, tolerance
@@ -225,7 +225,7 @@ def _best_mid_worst(study: Study, aggregate: Aggregate, seed: int) -> tuple[Sets
 def _aggregated_otherwise(map_: RuleMap) -> Iterator[str]:
     """Yield sentences on results that are not aggregated like the map: by another method, or without the random
     effect."""
-    how = in_place(map_)
+    how = how_aggregated(map_)
     if how:
         yield (
             f"The map is aggregated by the rule {map_.rule} from all answers at once; maps of fewer trials, and"

@@ -13,7 +13,7 @@ from hilbo.population.shared.hierarchical import Share
 from hilbo.study.config import Study
 from hilbo.study.estimate.optimum import predict_map
 
-__all__ = ["SURE", "heterogeneity", "in_place", "rule_warnings", "share_content"]
+__all__ = ["SURE", "heterogeneity", "how_aggregated", "rule_warnings", "share_content"]
 
 SURE = 3.0  # log Bayes factor, about 20 to 1
 _TOO_SURE = 1.5  # times as large as the map says: a standard deviation worth a sentence
@@ -36,7 +36,7 @@ def share_content(share: Share) -> dict[str, Any]:
     }
 
 
-def in_place(map_: RuleMap) -> str:
+def how_aggregated(map_: RuleMap) -> str:
     """How maps of fewer trials and of bootstrap resamples are aggregated, as a phrase such as "by bcm"; "" if as the
     map itself."""
     rule = RULES[map_.rule]

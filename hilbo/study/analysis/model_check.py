@@ -165,8 +165,8 @@ def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> Content | None:
 
 
 def _densities(left: LeftOut, x: Float[np.ndarray, "n d"], categories: int) -> Content:
-    """Mean negative log density (nats per response) of the map, and of each baseline with its difference from the map's
-    and the error of that."""
+    """Mean negative log density of the responses (nats per response): "map", and for each baseline "cost", "difference"
+    from the map's and its standard "error". Baselines are fitted without the participant's group, of up to 12."""
     _, place = np.unique(left.person, return_inverse=True)
     groups = place % _GROUPS
     costs = {name: np.empty(len(left.q)) for name in _BASELINES}

@@ -31,7 +31,7 @@ def new_file(path: Path, *, replace: bool, mode: int = _OWNER_ONLY) -> Iterator[
     from the folder. Raises OSError.
     """
     remove_unfinished(path.parent)
-    unfinished, file = _begun(path.parent)
+    unfinished, file = _create_unfinished(path.parent)
     try:
         yield unfinished
         if mode != _OWNER_ONLY:
@@ -86,7 +86,7 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def _begun(folder: Path) -> tuple[Path, int]:
+def _create_unfinished(folder: Path) -> tuple[Path, int]:
     """Create and lock a temporary file with a new random name; returns its path and descriptor."""
     while True:
         path = folder / UNFINISHED.replace("*", secrets.token_hex(8))

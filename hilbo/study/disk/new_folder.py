@@ -35,7 +35,7 @@ def new_folder(out: Path, check: Callable[[], None]) -> Iterator[Path]:
     is in a withdrawal, and OSError.
     """
     try:
-        made, filling = _begun(out, check)
+        made, filling = _create_unfinished(out, check)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); choose another folder.") from error
     try:
@@ -70,7 +70,7 @@ def recover(folder: Path) -> list[Path]:
     return filled
 
 
-def _begun(out: Path, check: Callable[[], None]) -> tuple[Path, int]:
+def _create_unfinished(out: Path, check: Callable[[], None]) -> tuple[Path, int]:
     """Create the temporary folder of `out`, and missing parents; returns its path and the descriptor of its lock.
     Leftovers are recovered and `check` is called first. Raises InputError and OSError."""
     out.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

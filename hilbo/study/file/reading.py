@@ -1,9 +1,10 @@
 """The study file, read and checked: the record from which plans, logs, tables and devices take what they need. Loads no
 JAX.
 
-A study file is TOML (docs, "Study file"). Every mistake becomes one `InputError`: `file:line: key.path is …, it must be
-…`. The hash is the first 16 hex digits of the SHA-256 of the parsed content as JSON, in the order of the schemas, with
-defaults left out: writing a default explicitly does not change it, the order of the parameters does.
+A study file is TOML (docs, "Study file"). Every mistake becomes one `InputError`:
+`file:line: key.path is …, it must be …`. The hash is the first 16 hex digits of the SHA-256 of the parsed content as
+JSON, in the order of the schemas, with defaults left out: writing a default explicitly does not change it, the order of
+the parameters does.
 """
 
 import hashlib
@@ -77,7 +78,7 @@ class StudyFile:
     def load(path: str | os.PathLike) -> "StudyFile":
         """Read and check a study file, without building its model. Raises `InputError`, one sentence with the place of
         the mistake."""
-        return read_study(path, _itself)
+        return read_study(path, _identity)
 
     @cached_property
     def hash(self) -> str:
@@ -135,7 +136,7 @@ def _of_material(file: StudyFile, name: str) -> StudyFile:
     if name not in file.materials:
         listed = ", ".join(file.materials) or "there are none"
         raise InputError(f"{prefix(file.source)}materials.{name} is not in the study, its materials: {listed}.")
-    return checked(of_material({"schema": 1} | json.loads(file.content), name), file.source, _itself)
+    return checked(of_material({"schema": 1} | json.loads(file.content), name), file.source, _identity)
 
 
 def _file(raw: Mapping[str, Any], source: str) -> StudyFile:
@@ -165,6 +166,6 @@ def _as_json(tables: Mapping[str, Any]) -> str:
     return json.dumps(tables, ensure_ascii=False, separators=(",", ":"))
 
 
-def _itself(file: StudyFile) -> StudyFile:
+def _identity(file: StudyFile) -> StudyFile:
     """Identity, as the `make` of `read_study`."""
     return file

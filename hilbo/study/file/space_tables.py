@@ -90,8 +90,8 @@ def _kind_of(table: Any) -> type[ParameterTable | LevelsTable]:
 
 
 def _of_one_kind(table: Any, path: str) -> Any:
-    """The same parsed table of a parameter. Raises `InputError` if it combines levels with keys of numbers, or has a
-    correlation without levels."""
+    """Return a parameter's parsed table unchanged. Raises `InputError` if it combines levels with keys of numbers, or
+    has a correlation without levels."""
     if _kind_of(table) is LevelsTable:
         beside = next((key for key in table if key in _NUMBERS_KEYS), None)
         if beside is not None:

@@ -19,9 +19,9 @@ __all__ = [
     "check_id",
     "check_text",
     "formulas",
+    "invalid_ids",
     "is_decimal",
     "is_id",
-    "no_ids",
     "runs_in_a_spreadsheet",
     "without_decimal_comma",
 ]
@@ -81,7 +81,7 @@ def formulas(cells: Iterable[str]) -> set[str]:
     return {cell for cell in set(cells) if runs_in_a_spreadsheet(cell)}
 
 
-def no_ids(cells: Iterable[str]) -> set[str]:
+def invalid_ids(cells: Iterable[str]) -> set[str]:
     """The set of those cells that are not valid participants' ids."""
     return {cell for cell in set(cells) if not is_id(cell)}
 

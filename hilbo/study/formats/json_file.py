@@ -18,7 +18,7 @@ from hilbo.errors import InputError
 from hilbo.search.box import Parameter
 from hilbo.study.formats.parsing import UNREADABLE
 
-__all__ = ["Content", "check_values", "converted", "decoded", "digest_of", "read_bytes", "sealed", "unsealed"]
+__all__ = ["Content", "check_seal", "check_values", "converted", "decoded", "digest_of", "read_bytes", "sealed"]
 
 Content = dict[str, Any]
 """A JSON object: texts, numbers, lists and further objects by their keys."""
@@ -70,7 +70,7 @@ def sealed(pieces: Iterable[str]) -> Iterator[str]:
     yield f'{before},\n  "digest": "{hashed.hexdigest()[:16]}"{_END}'
 
 
-def unsealed(content: bytes, digest: str | None, source: str) -> None:
+def check_seal(content: bytes, digest: str | None, source: str) -> None:
     """Raise InputError if `digest`, as read from the content, is not the digest of the text before it. None (a file
     without a digest) passes. Returns nothing."""
     if digest is None:

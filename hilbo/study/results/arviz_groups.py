@@ -52,7 +52,7 @@ def groups(
     held = mask[None, None]
     observed = np.where(mask, np.asarray(cohort.trials.q), -1)
     constants: dict[str, Any] = {
-        p.name: (_DIMS[2:], np.where(mask, cohort.physical[..., i], np.nan), _of(p))
+        p.name: (_DIMS[2:], np.where(mask, cohort.physical[..., i], np.nan), _attributes(p))
         for i, p in enumerate(study.space.parameters)
     }
     likelihood = jax.tree.map(lambda leaf: leaf[0], posteriors.gp).likelihood  # what a rule learnt, where it learns
@@ -74,7 +74,7 @@ def groups(
     }
 
 
-def _of(parameter: Parameter) -> dict[str, Any]:
+def _attributes(parameter: Parameter) -> dict[str, Any]:
     """netCDF attributes of a parameter: its unit, or for levels the meaning of each number."""
     if not parameter.levels:
         return {"units": parameter.unit}

@@ -41,8 +41,8 @@ def listed(folder: Path) -> Listed:
 
 
 def list_files(folder: Path, command: str = "", where: str = "") -> None:
-    """Write the list of all files that are now in a folder and below, with their digests; an existing list is
-    replaced."""
+    """Write the list of all files that are now in a folder and below, with their digests, without the list itself and
+    the lock file; an existing list is replaced."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in (LIST, LOCK))
     write_list(folder, Listed({path.relative_to(folder).as_posix(): digest(path) for path in files}, command, where))
 

@@ -9,7 +9,7 @@ import numpy as np
 from hilbo.errors import InputError
 from hilbo.study.config import Study
 from hilbo.study.formats.cell_text import check_id
-from hilbo.study.formats.json_file import check_values, decoded, read_bytes, unsealed
+from hilbo.study.formats.json_file import check_seal, check_values, decoded, read_bytes
 
 __all__ = ["FoundOptimum", "FoundPerson", "Result", "read_result"]
 
@@ -47,7 +47,7 @@ def read_result(path: str | os.PathLike, study: Study) -> Result:
     passive."""
     source, content = str(path), read_bytes(path)
     result: Result = decoded(content, Result, source, _WHAT)
-    unsealed(content, result.digest, source)
+    check_seal(content, result.digest, source)
     if result.study != study.file.hash:
         raise InputError(
             f"{path}: is the result of another study ({result.study}, not {study.file.hash}); aggregate the answers"

@@ -85,8 +85,9 @@ def role_of(name: str) -> str:
 
 
 def source_of(name: str, material: str | None = None) -> str:
-    """Source of a set, "aggregate" or "individual:PARTICIPANT", from its name as plans form it: `[MATERIAL
-    ][PARTICIPANT ]ROLE`, or `[MATERIAL ]SOURCE` (which may be "sysid"). "aggregate" for any other name."""
+    """Source of a set, "aggregate" or "individual:PARTICIPANT", from its name as plans form it:
+    `[MATERIAL ][PARTICIPANT ]ROLE`, or `[MATERIAL ]SOURCE` (which may be "sysid"). "aggregate" for any other name.
+    `material`: name to remove from the front."""
     rest = name.removeprefix(f"{material} ") if material else name
     before, _, last = rest.rpartition(" ")
     if last in ROLES:

@@ -20,7 +20,7 @@ import pandas as pd
 from hilbo.errors import InputError, warn_caller
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES, FlagCounts
-from hilbo.study.formats.cell_text import FORMULA_WORDS, ID_WORDS, but_for_case, check_text, formulas, no_ids
+from hilbo.study.formats.cell_text import FORMULA_WORDS, ID_WORDS, but_for_case, check_text, formulas, invalid_ids
 from hilbo.study.formats.csv_file import (
     FRAME,
     answer_forms,
@@ -35,10 +35,10 @@ __all__ = [
     "NOT_FITTED",
     "NothingToFitError",
     "TrialTable",
+    "boolean_column",
     "check_people",
     "check_recoding",
     "check_texts",
-    "flags",
     "is_fitted",
     "joined",
     "of_material",
@@ -174,7 +174,7 @@ def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, te
         table[parameter.name] = parameter_values(text, parameter, source)
     table["category"] = _categories(text["response"], study.responses, source)
     table["_blinded"] = text["unblinded"].str.strip().str.lower().isin(_FALSE) if "unblinded" in text else True
-    table["_fitted"] = ~flags(text, "voided", source) & (is_fitted(text["phase"]) if "phase" in text else True)
+    table["_fitted"] = ~boolean_column(text, "voided", source) & (is_fitted(text["phase"]) if "phase" in text else True)
     return pd.DataFrame(table, index=text.index)
 
 
@@ -252,7 +252,7 @@ def is_fitted(phases: pd.Series) -> pd.Series:
     return ~plain.isin([phase.replace("-", "") for phase in NOT_FITTED])
 
 
-def flags(text: pd.DataFrame, column: str, source: str) -> pd.Series:
+def boolean_column(text: pd.DataFrame, column: str, source: str) -> pd.Series:
     """A column of 1/0, true/false or yes/no as a Boolean Series; empty cells are False, and so are all rows if there is
     no such column. Raises InputError for other text."""
     if column not in text:
@@ -310,7 +310,7 @@ def check_people(text: pd.DataFrame, source: str) -> None:
     """Raise `InputError` for a row without a participant, or with an invalid id."""
     cells = text["participant"]
     refuse(cells == "", source, lambda row: "participant is empty; give each row a participant.")
-    refuse(cells.isin(no_ids(cells)), source, lambda row: f'participant is "{cells.at[row]}"; {ID_WORDS}.')
+    refuse(cells.isin(invalid_ids(cells)), source, lambda row: f'participant is "{cells.at[row]}"; {ID_WORDS}.')
 
 
 def check_texts(text: pd.DataFrame, source: str, numeric: Collection[str] = ()) -> None:

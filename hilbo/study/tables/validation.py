@@ -20,7 +20,7 @@ from hilbo.search.box import Parameter
 from hilbo.study.formats.csv_file import answer_forms, numbers, read_cells, refuse
 from hilbo.study.tables.flag_counts import counted_flags, flagged, with_flag_counts
 from hilbo.study.tables.parameter_sets import read_sets
-from hilbo.study.tables.trials import check_people, check_texts, flags, is_fitted
+from hilbo.study.tables.trials import boolean_column, check_people, check_texts, is_fitted
 
 __all__ = ["NONE", "RESPONSES", "TIE", "check_validation", "of_material", "read_validation", "sets_frame"]
 
@@ -81,7 +81,7 @@ def check_validation(
     nothing = (out["class_a"] == NONE) & (out["class_b"] == NONE) & (out["preferred"] == NONE)
     refuse(nothing, source, lambda row: "holds no answer; fill in class_a and class_b, or preferred, or leave it out.")
     _check_duplicates(out, source)
-    counts = ~flags(text, "voided", source) & (is_fitted(text["phase"]) if "phase" in text else True)
+    counts = ~boolean_column(text, "voided", source) & (is_fitted(text["phase"]) if "phase" in text else True)
     flags_of = counted_flags(out[counts], exclude_flags)
     counts &= ~flagged(out, exclude_flags)
     if not counts.any():
