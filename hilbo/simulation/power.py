@@ -132,7 +132,8 @@ def _pool(jobs: int, initializer: Callable[[], None] | None) -> Iterator[Process
 
 
 def _study_in_process(content: str, rule: str, population_: Population, plan: Plan, index: int) -> pd.DataFrame:
-    """`one_study` from arguments that can be sent to another process. `content`: the study file as JSON."""
+    """Simulate study number `index` of the plan and return its errors, from arguments that can be sent to another
+    process. `content`: the study file as JSON; `rule`: aggregation method."""
     study = by_rule(Study.from_dict({"schema": 1} | json.loads(content)), rule)
     return one_study(study, population_, plan, index)
 

@@ -49,8 +49,9 @@ class Study(eqx.Module):
 
     @staticmethod
     def from_dict(raw: Mapping[str, Any], source: str = "") -> "Study":
-        """As `load`, from the tables of a parsed study file; numbers and lists may be NumPy's. `source`: path for error
-        messages. Raises InputError as `load` does."""
+        """Check the tables of a parsed study file and build its study; numbers and lists may be NumPy's. The overrides
+        of every material are checked too. `source`: path for error messages. Raises InputError: one sentence with the
+        key, the mistake and its remedy."""
         if not isinstance(raw, Mapping):
             raise InputError(f"Study: this is a {type(raw).__name__}; give a study file's tables, or Study.load(path).")
         return checked(_plain(raw), source, Study.of)

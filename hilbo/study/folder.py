@@ -272,8 +272,8 @@ def _reference(
 
 
 def _departures(folder: Path, study: Study, materials: list[Material]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Compare the sessions with plan.json; returns (deviations, confirmation) as `departures.departures` does. ((), ())
-    without a plan. Responses excluded for their flags are counted too."""
+    """Compare the sessions with plan.json; returns (sentences on deviations, sentences that confirm the plan), one of
+    them empty; both without a plan. Responses excluded for their flags are counted too. Raises InputError."""
     path = folder / "plan.json"
     if not path.exists():
         return (), ()

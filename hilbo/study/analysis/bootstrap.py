@@ -51,7 +51,8 @@ def _tops(
     share: ArrayLike | None,
     prior: Float[Array, ""],
 ) -> Int[Array, " draws"]:
-    """Compiled `resampled_tops`; `rows`: participants of each resample."""
+    """For each resample of participants (`rows`: their indices) the row of `points` where its map is highest,
+    compiled."""
     means, explained = jax.lax.map(lambda person: person.predict_explained(points), posteriors)
 
     def one(chosen: Int[Array, " M"]) -> Int[Array, ""]:

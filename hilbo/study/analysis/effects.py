@@ -46,8 +46,8 @@ def effects_of(
 
 
 def _effect(study, surface, optimum, points, i) -> Effect:
-    """Effect of the parameter with index `i`; `points` (n, d): feasible points over which the main effect is
-    averaged."""
+    """Slice through `optimum` (d,) along the parameter with index `i`, and its main effect, averaged over the feasible
+    `points` (n, d). `surface`: as in `effects_of`."""
     parameter = study.space.parameters[i]
     axis = parameter.axis(_VALUES)
     along, allowed = slice_through(study, jnp.asarray(optimum), parameter.name, jnp.asarray(axis))

@@ -20,7 +20,8 @@ _TOO_SURE = 1.5  # times as large as the map says: a standard deviation worth a 
 
 
 def heterogeneity(aggregate: Any) -> dict[str, Any] | None:
-    """`share_content` of an aggregate, for result.json; None if its shared variance fraction was not estimated."""
+    """Estimate of how much participants differ, as a dict for result.json (`share_content`); None if the aggregate has
+    none."""
     return None if aggregate.share is None else share_content(aggregate.share)
 
 

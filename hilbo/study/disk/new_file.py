@@ -50,8 +50,8 @@ def new_file(path: Path, *, replace: bool, mode: int = _OWNER_ONLY) -> Iterator[
 
 
 def write_file(path: Path, content: str | bytes, *, replace: bool, mode: int = _OWNER_ONLY) -> None:
-    """Write a whole file atomically, as `new_file` does; text in UTF-8. Raises OSError, FileExistsError without
-    `replace`."""
+    """Write a whole file atomically (text in UTF-8): after an error `path` is unchanged. `mode`: its permissions.
+    Raises OSError, and FileExistsError if `path` exists, unless `replace`."""
     with new_file(path, replace=replace, mode=mode) as unfinished:
         unfinished.write_bytes(content.encode() if isinstance(content, str) else content)
 

@@ -169,7 +169,8 @@ def fit_cohort(
 def _fitted(
     study: Study, cohort: Cohort, gps: OrdinalGP | None, inference: Inference | None, say: SayCount
 ) -> Posterior:
-    """As `fit_cohort`, in batches; `say` is called after each batch if there are several."""
+    """Posterior of each participant, stacked (M), fitted in batches. None for `gps` and `inference`: the study's. `say`
+    is called after each batch if there are several."""
     by = study.inference if inference is None else inference
     if gps is None:
         return _in_batches(lambda trials: _fit_cohort(study.gp, trials, by), cohort.trials, "participants fitted", say)

@@ -87,7 +87,11 @@ def location_sentences(
 def location_notes(
     study: Study, x: Float[Array, " d"], sd: Float[Array, ""], asked: Float[Array, ""] | None
 ) -> list[str]:
-    """As `location_sentences`, in a few words each, for a table."""
+    """The location of an optimum x (d,) in the unit cube in a few words per fact, for a table; an empty list if there
+    is nothing to note.
+
+    `sd`, `asked`: the map's standard deviation at x, and its largest variance at a tested stimulus (None: not checked).
+    """
     edges = _edges(study, np.asarray(x))
     notes = [f"at {end}" for end in edges.ends]
     notes += [f"on the constraint {words}" for words in edges.constraints]

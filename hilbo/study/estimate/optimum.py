@@ -78,7 +78,7 @@ def predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m
 
 @program
 def _predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Compiled `predict_map`."""
+    """Mean and variance (m,) of a map at points of the unit cube, compiled."""
     return map_.predict(x)
 
 
@@ -99,7 +99,8 @@ def population_optimum(
 
 @program
 def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidates, rule, share) -> Optimum:
-    """Compiled `population_optimum`."""
+    """Feasible maximum of the mean of a point-by-point map of stacked posteriors, compiled. `rule`, `share`: as in
+    `predict_people`; `candidates` (m, d): start of the search."""
     apart = 0.0 if share is None else (1.0 - share) * gp.kernel.variance
     values = predict_people(posteriors, candidates, rule, share)[0]
     return _optimum(
@@ -134,7 +135,8 @@ def _nameless(map_: RuleMap) -> RuleMap:
 def _map_optimum(
     likelihood: OrdinalProbit, space: SearchSpace, map_: RuleMap, candidates: Float[Array, "m d"]
 ) -> Optimum:
-    """Compiled `map_optimum` for maps that are not centred."""
+    """Optimum of a map that is not centred, compiled: maximum of the mean, or, if the method learns hyperparameters, of
+    the probability of a new participant's highest response where the map's variance is at most `_reach`."""
     if not RULES[map_.rule].learns:
         single = jnp.float32  # which ranks the candidates; the best are scored again
         values = predict_map(map_.astype(single), candidates.astype(single))[0]
@@ -165,8 +167,12 @@ def _centre(
     places: Float[Array, "p d"],
     share: Float[Array, " p"],
 ) -> Optimum:
-    """Compiled `map_optimum` for centred maps. `places` (p, d), `share` (p,): points, and how often each was the best
-    of a joint draw."""
+    """Optimum of a centred map, compiled: the point nearest to most of the best points of joint draws (`nearness`),
+    where the probability of a new participant's highest response is within 0.05 of its maximum and the variance at most
+    `_reach`.
+
+    `places` (p, d), `share` (p,): points, and how often each was the best of a joint draw.
+    """
     assert map_.shared is not None
     near = partial(nearness, map_.shared.gp.kernel, places, share)
     mean, variance = map_.predict(candidates)
@@ -237,7 +243,8 @@ def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Arr
 
 @program
 def _individual_optima(space: SearchSpace, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
-    """Compiled `individual_optima`; one participant after the other on a CPU, in batches of 256 elsewhere."""
+    """Feasible maximum of each participant's posterior mean, stacked (M), compiled; one participant after the other on
+    a CPU, in batches of 256 elsewhere."""
 
     def one(posterior, space, candidates):
         x = best_point(space, posterior, candidates).x

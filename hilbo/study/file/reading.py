@@ -113,8 +113,12 @@ def read_study(path: str | os.PathLike, make: Callable[[StudyFile], _T]) -> _T:
 
 
 def checked(raw: Mapping[str, Any], source: str, make: Callable[[StudyFile], _T], text: str = "") -> _T:
-    """As `read_study`, from the parsed tables. `source`: path for messages, or ""; `text`: text of the file, in which
-    the line of a mistake is found. Raises InputError."""
+    """Check the parsed tables of a study file; returns `make` of its StudyFile. `make` is also called for each
+    material's file.
+
+    `source`: path for messages, or ""; `text`: text of the file, in which the line of a mistake is found. Raises
+    InputError, also for one of `make`, with the file and the line.
+    """
     place = ""
     try:
         check_parsed(raw)
@@ -132,7 +136,8 @@ def checked(raw: Mapping[str, Any], source: str, make: Callable[[StudyFile], _T]
 
 @lru_cache(maxsize=32)  # every event of a log may ask for its block's
 def _of_material(file: StudyFile, name: str) -> StudyFile:
-    """See `StudyFile.material`; the last 32 are cached."""
+    """The file of one material: its overrides of [renderer] and [parameters] applied, without [materials]. Raises
+    `InputError` for an unknown name. The last 32 are cached."""
     if name not in file.materials:
         listed = ", ".join(file.materials) or "there are none"
         raise InputError(f"{prefix(file.source)}materials.{name} is not in the study, its materials: {listed}.")

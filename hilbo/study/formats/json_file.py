@@ -36,8 +36,8 @@ def read_bytes(path: str | os.PathLike) -> bytes:
 
 
 def decoded(content: bytes, kind: Any, source: str, what: str) -> Any:
-    """Parse JSON as an object of the type `kind`. `what`: middle of the message, what the file is not and where to get
-    one. Raises InputError."""
+    """Parse JSON as an object of the type `kind`. `source`: the file, `what`: what is wrong and what to do, both for
+    the message. Raises InputError if the bytes are not JSON, or not of this type."""
     try:
         return msgspec.json.decode(content, type=kind)
     except UNREADABLE as error:
@@ -45,7 +45,8 @@ def decoded(content: bytes, kind: Any, source: str, what: str) -> Any:
 
 
 def converted(raw: Any, kind: Any, source: str, what: str) -> Any:
-    """As `decoded`, from parsed Python data. Raises InputError."""
+    """Convert parsed Python data to an object of the type `kind`. `source`: the file, `what`: what is wrong and what to
+    do, both for the message. Raises InputError if they are not of this type."""
     try:
         return msgspec.convert(raw, kind)
     except UNREADABLE as error:

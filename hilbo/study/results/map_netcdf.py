@@ -182,8 +182,12 @@ def _check_grid(path, study, axes, shape, *dims) -> None:
 
 
 def _check_points(path, study, axes, shape, *dims) -> None:
-    """Raise InputError unless the points have all parameters of the study and are feasible; arguments as for
-    `_check_grid`."""
+    """Raise InputError unless the points of a map have all parameters of the study, within their ranges, and are
+    feasible.
+
+    `axes`: parameter -> its values in physical units; `shape`: of the mean; `dims`: dimension names of mean and
+    variance.
+    """
     whole = all(d == ("point",) for d in dims) and set(axes) == set(study.space.names)
     for p in study.space.parameters if whole else ():
         whole = whole and axes[p.name].shape == shape and all(p.holds(value) for value in axes[p.name].tolist())

@@ -58,8 +58,8 @@ def added(parts: Iterable[FlagCounts]) -> FlagCounts:
 
 
 def flag_sentences_of(counts: FlagCounts, exclude: Collection[str], what: str = "trials") -> list[str]:
-    """As `flag_sentences`, but an empty list if no trial has a flag and the study excludes none. `what`: plural of what
-    is counted."""
+    """One sentence on the number of trials per flag and the number excluded; an empty list if no trial has a flag and
+    the study excludes none. `what`: plural of what is counted."""
     return flag_sentences(counts, exclude, what) if counts.flagged or exclude else []
 
 

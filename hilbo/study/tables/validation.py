@@ -41,11 +41,11 @@ def read_validation(
     material: str | None = None,
     exclude_flags: Collection[str] = (),
 ) -> pd.DataFrame:
-    """Read and check the comparisons of one material; None if the table has at most one. `responses`: the study's
-    labels, lowest first.
+    """Read a validation table and check its comparisons. `material`: select its rows; required if the table has
+    several. `responses`: the study's labels, lowest first.
 
     All columns are text but `trial`; classes are labels, `preferred` and `first` names of sets (or "tie"), or empty.
-    Rows with one of `exclude_flags` are left out. Raises `InputError`.
+    Rows that are warm-up, repeated or voided, and those with one of `exclude_flags`, are left out. Raises `InputError`.
     """
     text = read_cells(path, "a validation table needs a header and a comparison")
     if "material" in text:
