@@ -26,12 +26,15 @@ class NotKeptError(Exception):
 
 
 def describe(function: Callable, args: tuple, kwargs: dict[str, Any]) -> str:
-    """Key of a call: arrays by shape, dtype and weak type, everything else by value."""
+    """Cache key of a call: arrays by shape, dtype and weak type, everything else by value.
+
+    Raises `NotKeptError` for a function or an argument without a stable description.
+    """
     return f"{name_of(function)} {_words(args)} {_words(kwargs)}"
 
 
 def name_of(what: Any) -> str:
-    """Qualified name of a function or class. Raises `NotKeptError` if the name does not lead to it."""
+    """Module and qualified name of a function or class. Raises `NotKeptError` if that name does not lead to it."""
     module, path = getattr(what, "__module__", None), getattr(what, "__qualname__", "")
     named: Any = sys.modules.get(str(module))
     for part in path.split("."):
@@ -42,7 +45,7 @@ def name_of(what: Any) -> str:
 
 
 def _words(what: Any) -> str:
-    """Description of one argument."""
+    """Description of one argument. Raises `NotKeptError` if it has no stable one."""
     if isinstance(what, jax.Array):
         return f"array:{what.dtype}{list(what.shape)}{'weak' * _weak(what)}"
     if isinstance(what, np.ndarray | np.generic):
@@ -62,7 +65,7 @@ def _weak(array: jax.Array) -> bool:
 
 
 def _words_of_parts(what: Any) -> str:
-    """Description of a class, function or container. Raises `NotKeptError` for other types."""
+    """Description of a class, function, container or record. Raises `NotKeptError` for other types."""
     if isinstance(what, enum.Enum):
         return f"{name_of(type(what))}.{what.name}"
     if isinstance(what, type | FunctionType | BuiltinFunctionType):
@@ -85,7 +88,10 @@ def _words_of_parts(what: Any) -> str:
 
 
 def _words_of_fields(what: Any) -> str:
-    """Description of a dataclass. Arrays are allowed only in the dynamic fields of an Equinox module."""
+    """Description of a dataclass by its fields, with arrays only in the dynamic ones of an Equinox module.
+
+    Raises `NotKeptError` for an array in any other field.
+    """
     dynamic = isinstance(what, eqx.Module)
     parts = []
     for field in dataclasses.fields(what):

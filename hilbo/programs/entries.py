@@ -18,7 +18,7 @@ _SUFFIX = ".program"
 
 
 class Entry(msgspec.Struct, forbid_unknown_fields=True):
-    """Cached program: its key, the structures of its arguments and results, and the compiled code."""
+    """Cached program: `words`, its key; the pickled structures of its arguments and results; and the compiled code."""
 
     words: str
     structure: bytes
@@ -26,16 +26,21 @@ class Entry(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Entries:
-    """Entries of a folder, which is created private to this user if needed.
+    """Cached programs in the files of a folder, up to `size` bytes together.
 
-    `remark` receives messages about unusable ones.
+    The folder is created by `write`, private to this user. `remark` is called with a sentence about each problem; no
+    problem with the disk is raised by `read` and `write`.
     """
 
     def __init__(self, folder: Path, remark: Callable[[str], None], size: int = _SIZE):
         self.folder, self._remark, self._size = folder, remark, size
 
     def read(self, words: str) -> Entry | None:
-        """Entry with this key; None if it is missing, damaged or not private to this user."""
+        """Entry with the key `words`; None if it is missing, damaged or not private to this user.
+
+        Marks the entry as recently used. A remark is made about a damaged entry and about one that another user could
+        change.
+        """
         path = self._path(words)
         try:
             if not is_private(self.folder) or not is_private(path):
@@ -57,7 +62,10 @@ class Entries:
         return entry
 
     def write(self, entry: Entry) -> None:
-        """Write an entry atomically, then delete the least recently used ones beyond the size limit."""
+        """Write an entry atomically, then delete the least recently used ones beyond the size limit.
+
+        If the folder is not private to this user or cannot be written, a remark is made and nothing is written.
+        """
         body = msgspec.msgpack.encode(entry)
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -74,7 +82,7 @@ class Entries:
             self._remark(f"{self.folder}: programs cannot be kept there ({error.strerror}).")
 
     def sizes(self) -> dict[Path, int]:
-        """Size (bytes) of each entry, least recently used first."""
+        """Size (bytes) of each entry's file, least recently used first; empty if there is no folder."""
         entries = []
         for path in self.folder.glob(f"*{_SUFFIX}"):
             with contextlib.suppress(FileNotFoundError):  # another process drops it
@@ -82,7 +90,7 @@ class Entries:
         return {path: size for _, path, size in sorted(entries)}
 
     def clear(self) -> None:
-        """Delete every entry."""
+        """Delete all entries of the folder."""
         for path in self.sizes():
             path.unlink(missing_ok=True)
 
@@ -97,5 +105,5 @@ class Entries:
             total -= size
 
     def _path(self, words: str) -> Path:
-        """File of the entry with this key."""
+        """File of the entry with this key, whether it exists or not."""
         return self.folder / f"{hashlib.sha256(words.encode()).hexdigest()}{_SUFFIX}"

@@ -20,18 +20,19 @@ __all__ = ["Programs"]
 
 
 class _Array(NamedTuple):
-    """Position of an array in a program's result."""
+    """Placeholder for an array in the structure of a program's result: its position among the arrays."""
 
     number: int
 
 
 class _Ready(NamedTuple):
-    """Loaded program: maps the arrays of a call to its result."""
+    """Loaded program; `run` maps arrays to arrays, `structure` is the result with placeholders for its arrays."""
 
     run: Callable
     structure: Any
 
     def __call__(self, arrays: Sequence[Any]) -> Any:
+        """Run the program on the arrays of a call; return the function's result in its own structure."""
         results = self.run(*arrays)
         return jax.tree.map(
             lambda leaf: results[leaf.number] if isinstance(leaf, _Array) else leaf,
@@ -61,7 +62,10 @@ class Programs:
     def __call__(
         self, function: Callable, args: tuple, kwargs: dict[str, Any]
     ) -> Callable[[Sequence[Any]], Any] | None:
-        """Program of a call as a function of the call's arrays; None if it cannot be cached."""
+        """Program of a call as a function of the call's arrays, loaded or compiled now; None if it cannot be cached.
+
+        Programs stay in memory, by function, shapes and other arguments. Calls may come from several threads.
+        """
         leaves, tree = jax.tree.flatten((args, kwargs))
         try:
             key = (function, tree, tuple(_kind(leaf) for leaf in leaves))
@@ -74,7 +78,10 @@ class Programs:
         return self._known[key]
 
     def _find(self, function, args, kwargs) -> _Ready | None:
-        """Load the program, or compile and write it; None if it cannot be cached."""
+        """Load the program from the entries, or compile and write it; None if it cannot be cached.
+
+        That is so with more than one device, or for arguments without a stable description.
+        """
         if jax.device_count() > 1:
             return None
         try:
@@ -85,7 +92,11 @@ class Programs:
         return self._make(words, function, args, kwargs) if entry is None else _ready(entry)
 
     def _make(self, words, function, args, kwargs) -> _Ready | None:
-        """Compile, write and read back a program; None if that fails or gives other bits."""
+        """Compile the program, run it, write it to the entries, and return the copy that was read back from its bytes.
+
+        None if serialisation fails or the copy gives other bits. Nothing is written if the package's code has changed
+        on disk since this cache was made. `words`: its key.
+        """
         leaves, tree = jax.tree.flatten((args, kwargs))
         structure = []
 
@@ -139,6 +150,7 @@ class _CompiledHere:
                 self._set(self._enabled)
 
     def _set(self, enabled: bool) -> None:
+        """Switch JAX's own compilation cache on or off for the process."""
         jax.config.update("jax_enable_compilation_cache", enabled)
         compilation_cache.reset_cache()  # JAX asks for the setting once
 
@@ -147,14 +159,14 @@ _compiled_here = _CompiledHere()
 
 
 def _ready(entry: Entry) -> _Ready:
-    """Load the program of an entry."""
+    """Deserialise the program of an entry; it is executable code, so the entry must be trusted."""
     _find_lapack()
     given, returned, structure = pickle.loads(entry.structure)
     return _Ready(serialize_executable.deserialize_and_load(entry.compiled, given, returned), structure)
 
 
 def _bits(results: Sequence[Any]) -> list[bytes]:
-    """Results as bytes, for comparison."""
+    """Each result as bytes, for comparison; a random key by its data."""
     keys = jax.dtypes.prng_key
     plain = (jax.random.key_data(r) if jax.numpy.issubdtype(r.dtype, keys) else r for r in results)
     return [np.asarray(result).tobytes() for result in plain]
@@ -162,16 +174,20 @@ def _bits(results: Sequence[Any]) -> list[bytes]:
 
 @functools.cache
 def _find_lapack() -> None:
-    """Register LAPACK's functions with XLA, which JAX does only when lowering a program that calls them."""
+    """Register LAPACK's functions with XLA, which JAX does only when it lowers a program that calls them."""
     jax.jit(jax.lax.linalg.cholesky).lower(np.ones((1, 1)))
 
 
 def _is_array(leaf: Any) -> bool:
+    """Whether a leaf is an array of JAX or an array or scalar of NumPy."""
     return isinstance(leaf, jax.Array | np.ndarray | np.generic)
 
 
 def _kind(leaf: Any) -> Any:
-    """Part of the in-memory key: shape and dtype of an array; any other leaf with its type, since 1 equals True."""
+    """Part of the in-memory key for one leaf: shape, dtype, weak type and type of an array; type and value of others.
+
+    The type is included because 1 equals True.
+    """
     if _is_array(leaf):
         return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False), type(leaf)
     return type(leaf), leaf

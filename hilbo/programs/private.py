@@ -9,7 +9,7 @@ __all__ = ["is_private", "private_folder"]
 
 
 def is_private(path: Path) -> bool:
-    """Whether a path belongs to this user and nobody else may write to it.
+    """Whether a path belongs to this user, is no symbolic link, and is not writable for group or others.
 
     On Windows only symbolic links are refused. Raises `OSError` if there is nothing at this path.
     """
@@ -20,10 +20,11 @@ def is_private(path: Path) -> bool:
 
 
 def private_folder(folder: Path) -> bool:
-    """Whether a folder and its entries belong to this user, and nobody else may write to it.
+    """Create a folder for this user alone if there is none; return whether only this user can have written to it.
 
-    It is created so if there is none. Entries are checked by their owner: one that another user has left there while
-    they could stays, whatever mode the folder has got since.
+    False if the folder or an entry directly in it belongs to another user, or if others may write to the folder. An
+    entry's mode is not checked, only its owner: what another user left there stays theirs. True if the folder cannot be
+    created.
     """
     with contextlib.suppress(OSError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)

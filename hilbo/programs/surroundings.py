@@ -15,7 +15,11 @@ _ELSEWHERE = ("cache", "log", "debug_info", "dump")  # settings that say where s
 
 
 def surroundings() -> str:
-    """Description of the environment; it differs whenever a program of the same code might."""
+    """Text that differs whenever the same code might compile to another program.
+
+    It holds versions, processor, devices, flags of XLA and JAX in the environment, and JAX's settings. Initialises
+    JAX's devices.
+    """
     import jax
 
     settings = {
@@ -33,7 +37,7 @@ def surroundings() -> str:
 
 
 def code_digest(package: Path) -> str:
-    """Hash of all Python files of a package, by name and content."""
+    """SHA-256 (hex) of all Python files below the folder of a package, by relative path and content."""
     whole = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         content = path.read_bytes()
@@ -43,7 +47,7 @@ def code_digest(package: Path) -> str:
 
 @functools.cache
 def _processor() -> str:
-    """Model and features of the processor, as reported by the system."""
+    """Model and features of the processor from /proc/cpuinfo; where there is none, `platform.processor()`. Cached."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

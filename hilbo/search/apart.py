@@ -13,7 +13,7 @@ __all__ = ["differences", "levels_of", "middle_of", "nrmse"]
 
 
 def levels_of(parameters: Sequence[Parameter]) -> tuple[int, ...]:
-    """Number of unordered levels of each coordinate, 0 for numeric ones; empty if all are numeric."""
+    """Number of unordered levels of each parameter, 0 for a numeric one; an empty tuple if all are numeric."""
     counts = tuple(p.steps if p.levels else 0 for p in parameters)
     return counts if any(counts) else ()
 
@@ -21,9 +21,9 @@ def levels_of(parameters: Sequence[Parameter]) -> tuple[int, ...]:
 def differences(
     levels: tuple[int, ...], x: Float[Any, "*#batch d"], y: Float[Any, "*#batch d"], apart: float = 1.0
 ) -> Float[Any, "... d"]:
-    """x - y by coordinate, (..., d); for categorical coordinates `apart` if the levels differ, else 0.
+    """x - y by coordinate, (..., d), in the unit cube; for categorical ones `apart` if the levels differ, else 0.
 
-    `levels`: as from `levels_of`.
+    `levels`: as from `levels_of`; an empty tuple for numeric coordinates alone.
     """
     if not levels:
         return x - y
@@ -39,13 +39,19 @@ def differences(
 
 
 def nrmse(x: Float[Any, "*#batch d"], y: Float[Any, "*#batch d"], levels: tuple[int, ...] = ()) -> Float[Array, "..."]:
-    """NRMSE between points of the unit cube: root mean square of `differences`. `x`, `y` (..., d) -> (...,)."""
+    """NRMSE between points of the unit cube: root mean square of `differences` over the coordinates.
+
+    `x`, `y` (..., d) -> a JAX array (...,); `levels` as from `levels_of`.
+    """
     away = differences(levels, np.asarray(x), np.asarray(y))
     return to_device(np.sqrt(np.mean(away**2, axis=-1)))
 
 
 def middle_of(levels: tuple[int, ...], x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " d"]:
-    """Mean of points by coordinate, (d,); for categorical coordinates the most frequent level."""
+    """Mean of points (n, d) by coordinate, (d,); for a categorical coordinate its most frequent value.
+
+    `levels`: as from `levels_of`. Of equally frequent values the lowest is taken.
+    """
     middle = x.mean(axis=0)
     for i in (i for i, count in enumerate(levels) if count):
         values, counts = np.unique(x[:, i], return_counts=True)

@@ -23,7 +23,7 @@ _SMALLEST = 2.0**-1022  # of the normal floating-point numbers: those below lose
 
 
 def _reads_as_a_number(text: str) -> bool:
-    """Whether a text can be parsed as a number."""
+    """Whether Python can parse the text as a number; "nan" and "inf" count."""
     try:
         float(text)
     except ValueError:
@@ -71,7 +71,7 @@ class Parameter:
 
     @classmethod
     def of_levels(cls, name: str, levels: tuple[str, ...], correlation: float = 0.5) -> "Parameter":
-        """Categorical parameter with unordered levels. Raises `InputError`."""
+        """Categorical parameter with unordered levels. Raises `InputError` for invalid level names or `correlation`."""
         return cls(name, 0.0, len(levels) - 1.0, levels=levels, correlation=correlation)
 
     def _check_levels(self, path: str) -> None:
@@ -105,43 +105,46 @@ class Parameter:
 
     @property
     def steps(self) -> int:
-        """Number of allowed values of a discrete parameter."""
+        """Number of allowed values of a discrete parameter; without meaning for a continuous one."""
         return round(self.high - self.low) + 1
 
     def shown(self, value: float) -> float | int | str:
-        """Physical number as shown in tables: name of the level, whole number, or the number itself."""
+        """Physical number as shown in tables: name of the level, whole number (int), or the number itself."""
         if self.levels:
             return self.levels[round(value)]
         return round(value) if self.integer else float(value)
 
     def column(self, values: Float[Any, " n"]) -> Any:
-        """Physical numbers as a table column: names of levels, else the numbers."""
+        """Physical numbers as a table column: a list of level names, or `values` itself for a numeric parameter."""
         return [self.shown(value) for value in values] if self.levels else values
 
     def words(self, value: float) -> str:
-        """Physical number as text, without its unit."""
+        """Physical number as text, without its unit: name of the level, whole number, or four significant digits."""
         return str(self.shown(value)) if self.discrete else f"{value:.4g}"
 
     def number(self, value: float | str) -> float:
-        """Inverse of `shown`; NaN for an unknown level and for values that are not numbers."""
+        """Physical number of a value as `shown` returns it: a level's position, or the number as a float.
+
+        NaN for an unknown level and for a numeric parameter's text or boolean; the range is not checked.
+        """
         if self.levels:
             return float(self.levels.index(value)) if value in self.levels else math.nan
         return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
 
     def holds(self, value: float) -> bool:
-        """Whether a physical number is an allowed value."""
+        """Whether a physical number is an allowed value: within the range, and whole if the parameter is discrete."""
         return self.low <= value <= self.high and (not self.discrete or value == round(value))
 
     @property
     def range_words(self) -> str:
-        """Description of the allowed values."""
+        """Text of the allowed values, such as "a number from 0 to 5 mm" or "one of red, green"."""
         if self.levels:
             return "one of " + ", ".join(self.levels)
         kind = "a whole number" if self.integer else "a number"
         return f"{kind} from {self.low:g} to {self.high:g} {self.unit}".rstrip()
 
     def axis(self, cells: int) -> Float[Any, " k"]:
-        """Values on [0, 1] along an axis of a figure: `cells` uniform ones, or at most as many discrete values."""
+        """Values on [0, 1] along an axis of a figure: `cells` uniform ones, or up to that many discrete values."""
         import numpy as np
 
         even = np.linspace(0.0, 1.0, cells)
@@ -151,7 +154,7 @@ class Parameter:
         return np.asarray(self.to_unit(step))
 
     def to_unit(self, value: Real[Any, "..."]) -> Float[Any, "..."]:
-        """Map physical values (array) to [0, 1]; computed from the nearer end, so that both ends are exact."""
+        """Map physical values (array) to [0, 1] on the parameter's scale; exact at both ends, not clipped."""
         xp = namespace_of(value)
         if self.scale == "log":
             above, below = xp.log1p((value - self.low) / self.low), xp.log1p((self.high - value) / value)
@@ -161,7 +164,7 @@ class Parameter:
         return xp.where(above < below, above / width, 1 - below / width)
 
     def to_physical(self, unit: Real[Any, "..."]) -> Float[Any, "..."]:
-        """Inverse of `to_unit`; within [low, high] for a `unit` in [0, 1].
+        """Map values of [0, 1] (array) to physical ones, on the parameter's scale; never outside [low, high] for those.
 
         A discrete parameter is rounded to its nearest value.
         """
@@ -264,7 +267,7 @@ class Box:
             self._check_constraint(constraint, f"constraints.{number}")
 
     def _check_constraint(self, constraint: Constraint, path: str) -> None:
-        """Raise `InputError` for an invalid constraint, or one on a categorical parameter."""
+        """Raise `InputError` for an invalid constraint, or one on a categorical parameter. `path` begins the text."""
         for name, weight in constraint.terms:
             if name not in self.names:
                 raise InputError(
@@ -300,7 +303,7 @@ class Box:
             )
 
     def _check_model(self) -> None:
-        """Raise `InputError` for parameters that do not suit the FO-SLS."""
+        """Raise `InputError` unless K1, B1 and alpha are there, continuous, above 0, and alpha below 1."""
         missing = [name for name in ("K1", "B1", "alpha") if name not in self.names]
         if missing:
             raise InputError(f"parameters.{missing[0]} is missing, the renderer's model needs K1, B1 and alpha.")

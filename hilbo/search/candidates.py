@@ -13,8 +13,8 @@ CANDIDATES = 4096
 
 
 def search_points(space: SearchSpace, seed: int, count: int = CANDIDATES) -> Float[Array, "m d"]:
-    """Candidate points of the unit cube: `count` inside the feasible set, a quarter of that on its boundary.
+    """Candidate points of the unit cube: `count` inside the feasible set, then a quarter of that on its boundary.
 
-    -> (`count` + `count` // 4, d).
+    -> (`count` + `count` // 4, d). Raises `InputError` if too few points are feasible.
     """
     return to_device(np.concatenate([space.candidates(count, seed), space.walls(count // 4, seed)]))

@@ -48,16 +48,19 @@ class Columns:
 
     @property
     def drawn(self) -> "Columns":
-        """Columns from which uniform points are drawn: those whose ends depend on B1 and alpha alone."""
+        """Columns from which uniform points are drawn: with the constraints on K1, B1 and alpha alone."""
         alone = (c for c in self.constraints if all(name in _MODEL for name, weight in c.terms if weight))
         return dataclasses.replace(self, constraints=tuple(alone))
 
     def index(self, name: str) -> int:
-        """Index of a parameter."""
+        """Coordinate of the parameter with this name."""
         return next(i for i, parameter in enumerate(self.parameters) if parameter.name == name)
 
     def from_shares(self, w: Float[Array, "*batch d"]) -> Float[Array, "*batch d"]:
-        """Map points whose K1 is a fraction of its column to the unit cube; x_K1 is 0 in an empty column."""
+        """Map points whose K1 is a fraction of its column, 0 to 1, to the unit cube; x_K1 is 0 in an empty column.
+
+        `w` (..., d) -> (..., d); all other coordinates are those of the unit cube and unchanged.
+        """
         K1 = self.index("K1")
         if not self.between:
             return w.at[..., K1].multiply(self.passive_end(w))
@@ -65,8 +68,10 @@ class Columns:
         return w.at[..., K1].set(start + w[..., K1] * width)
 
     def to_shares(self, w: Float[Array, "*batch d"], x: Float[Array, "*batch d"]) -> Float[Array, "*batch d"]:
-        """Inverse of `from_shares`: `w` with its K1 replaced by the share of the column, 0 to 1, at which K1 is. `x`:
-        the same points in the unit cube."""
+        """Inverse of `from_shares`: `w` with its K1 replaced by the fraction of the column at which the K1 of `x` is.
+
+        `x`: the same points in the unit cube. Not finite in an empty column.
+        """
         K1 = self.index("K1")
         if not self.between:
             return w.at[..., K1].divide(self.passive_end(x))
@@ -74,14 +79,17 @@ class Columns:
         return w.at[..., K1].set((x[..., K1] - start) / width)
 
     def passive_end(self, x: Float[Array, "*batch d"]) -> _Batch:
-        """Largest passive x_K1 (...,) in the columns of points, 0 if there is none."""
+        """Largest passive x_K1 (...,) in the columns of points, within the range of K1; 0 if there is none."""
         K1, B1, alpha = (self.index(name) for name in ("K1", "B1", "alpha"))
         physical = (self.parameters[i].to_physical(x[..., i]) for i in (B1, alpha))
         low, high = self.parameters[K1].low, self.parameters[K1].high
         return self.parameters[K1].to_unit(jnp.clip(largest_K1(self.mechanics, *physical), low, high))
 
     def interval(self, x: Float[Array, "*batch d"]) -> tuple[_Batch, _Batch]:
-        """Start and width (...,) of the columns of points, with a range of effective damping or constraints."""
+        """Start and width (...,) of the columns of points in x_K1, by passivity, effective damping and constraints.
+
+        The width is 0 for an empty column.
+        """
         K1 = self.parameters[self.index("K1")]
         physical = {p.name: p.to_physical(x[..., i]) for i, p in enumerate(self.parameters)}
         start, end = K1_interval(self.mechanics, K1, self.constraints, physical)
@@ -90,7 +98,7 @@ class Columns:
 
     @property
     def between(self) -> bool:
-        """Whether a column has a lower end, and an upper one besides the passive end."""
+        """Whether the columns are limited by effective damping or constraints, and not by passivity alone."""
         return self.mechanics.effective_damping is not None or self.constraints != ()
 
 
@@ -107,7 +115,10 @@ def column_ends(columns: Columns, x: Float[ArrayLike, "*batch d"]) -> tuple[_Bat
 
 @functools.lru_cache(maxsize=16)
 def column_table(columns: Columns) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
-    """Table of both ends of the columns on a grid of x_B1 (`ROWS`) and x_alpha (`COLUMNS`)."""
+    """Lower and upper ends of the columns in x_K1, on a grid of x_B1 (`ROWS`) and x_alpha (`COLUMNS`); cached.
+
+    Two arrays (257, 257); all other parameters are at the middle of their range.
+    """
     x = np.full((_CELLS + 1, _CELLS + 1, len(columns.parameters)), 0.5)
     x[..., columns.index("B1")], x[..., columns.index("alpha")] = ROWS[:, None], COLUMNS
     start, end = column_ends(columns, x)
@@ -116,7 +127,10 @@ def column_table(columns: Columns) -> tuple[Float[np.ndarray, "r c"], Float[np.n
 
 @functools.lru_cache(maxsize=16)
 def _cumulative_volume(columns: Columns) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "cells c"]]:
-    """Cumulative volume of the columns: over the rows of B1, and within each row over α, normalised."""
+    """Cumulative volume of the columns over the rows of B1, (257,), and within each row over alpha, (256, 257).
+
+    The former ends at the total volume, the latter at 1 in each row. Cached.
+    """
     start, end = column_table(columns)
     node = end - start
     mean = (node[1:, 1:] + node[1:, :-1] + node[:-1, 1:] + node[:-1, :-1]) / 4
@@ -128,14 +142,14 @@ def _cumulative_volume(columns: Columns) -> tuple[Float[np.ndarray, " r"], Float
 
 
 def volume(columns: Columns) -> float:
-    """Fraction of the unit cube that the columns fill: their mean width, on a grid. For `drawn` columns."""
+    """Fraction of the unit cube that the columns fill: their mean width, on a grid. Valid for `drawn` columns only."""
     return float(_cumulative_volume(columns)[0][-1])
 
 
 def rosenblatt(columns: Columns, uniform: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """Map uniform numbers (n, d) to points whose K1 is a fraction of its column; density proportional to its width.
+    """Map uniform numbers (n, d) to points whose density in (B1, alpha) is proportional to the column's width.
 
-    For `drawn` columns.
+    K1 stays a fraction of its column (`from_shares`), and other parameters stay. Valid for `drawn` columns only.
     """
     rows, within = _cumulative_volume(columns)
     B1, alpha = columns.index("B1"), columns.index("alpha")
@@ -149,7 +163,7 @@ def rosenblatt(columns: Columns, uniform: Float[np.ndarray, "n d"]) -> Float[np.
 
 
 def check_volume(columns: Columns) -> None:
-    """Raise `InputError` if every column is empty."""
+    """Raise `InputError` if every column is empty, with the key of the study file to change. For `drawn` columns."""
     if volume(columns) > 0:
         return
     mechanics, K1 = columns.mechanics, columns.parameters[columns.index("K1")]

@@ -49,7 +49,10 @@ _Physical = Mapping[str, Real[ArrayLike, "..."]]
 
 
 def allowed(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
-    """Whether parameter sets are passive with the search margin, and within the range of effective damping."""
+    """Whether parameter sets are passive with the search margin, and within the range of effective damping, if any.
+
+    `physical`: parameter -> values in its unit, of one shape; so is the result.
+    """
     if m.effective_damping is None:
         return passive(m, physical)
     low, high = m.effective_damping
@@ -59,9 +62,9 @@ def allowed(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
 
 
 def passive(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
-    """Whether parameter sets are passive with the search margin.
+    """Whether parameter sets are passive with the search margin (`SEARCH_MARGIN`), to rounding.
 
-    With a delay also whether the column starts at K1 = 0.
+    With a delay, the damping must also be at least `delay.least_damping`, below which no K1 is feasible.
     """
     b = m.damping * (1 - SEARCH_MARGIN)
     enough = minimum_damping(m, physical) <= b * (1 + _slack(physical))
@@ -69,7 +72,7 @@ def passive(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
 
 
 def _slack(physical: _Physical) -> float:
-    """Relative tolerance for rounding."""
+    """Relative tolerance for rounding: a multiple of eps of the parameters' dtype."""
     return _ROUNDING * float(jnp.finfo(jnp.result_type(1.0, *_model_parameters(physical))).eps)
 
 
@@ -101,7 +104,10 @@ def largest_K1(m: Mechanics, B1: _Batch, alpha: _Batch) -> _Batch:
 
 
 def K1_range(m: Mechanics, B1: _Batch, alpha: _Batch) -> tuple[_Batch, _Batch]:
-    """K1 (N/mm) at both ends of the range of effective damping: 0 to inf."""
+    """Lowest and highest K1 (N/mm) within the range of effective damping; inf for a damping that no K1 reaches.
+
+    `m` must have a range of effective damping.
+    """
     assert m.effective_damping is not None
     memory = span(m.memory, m.N, m.states)
     low, high = (viscoelastic.elementwise(_K1_of, memory, end, B1, alpha, m.T) for end in m.effective_damping)
@@ -109,7 +115,10 @@ def K1_range(m: Mechanics, B1: _Batch, alpha: _Batch) -> tuple[_Batch, _Batch]:
 
 
 def keeps(constraint: Constraint, physical: _Physical) -> Bool[Array, "..."]:
-    """Whether parameter sets satisfy a linear constraint, to the rounding of its sum."""
+    """Whether parameter sets satisfy a linear constraint, to the rounding of its sum.
+
+    `physical`: parameter -> values in its unit, of one shape; so is the result.
+    """
     parts = [weight * jnp.asarray(physical[name]) for name, weight in constraint.terms]
     total, size = functools.reduce(jnp.add, parts), functools.reduce(jnp.add, map(jnp.abs, parts))
     slack = _SUM_ROUNDING * jnp.finfo(total.dtype).eps * size
@@ -121,7 +130,11 @@ def keeps(constraint: Constraint, physical: _Physical) -> Bool[Array, "..."]:
 def K1_interval(
     m: Mechanics, K1: Parameter, constraints: tuple[Constraint, ...], physical: Mapping[str, _Batch]
 ) -> tuple[_Batch, _Batch]:
-    """Lowest and highest K1 on [0, 1] allowed by effective damping and constraints, given the other parameters."""
+    """Lowest and highest K1 on [0, 1] that effective damping and constraints allow; passivity is left out.
+
+    `physical`: the other parameters -> values in their units; the results have their shape. Each constraint must
+    involve K1. The interval is empty if the lowest is above the highest.
+    """
     low, high = jnp.zeros_like(physical["B1"]), jnp.ones_like(physical["B1"])
     ends = [] if m.effective_damping is None else [K1_range(m, physical["B1"], physical["alpha"])]
     for first, last in (*ends, *(_within(constraint, K1, physical) for constraint in constraints)):
@@ -131,7 +144,10 @@ def K1_interval(
 
 
 def _within(constraint: Constraint, K1: Parameter, physical: Mapping[str, _Batch]) -> tuple[_Batch, _Batch]:
-    """Lowest and highest K1 (N/mm) allowed by a constraint on it, minus a margin."""
+    """Lowest and highest K1 (N/mm) allowed by a constraint on it, narrowed by a margin for rounding at both ends.
+
+    `physical`: the other parameters -> values in their units. An end that is not limited is infinite.
+    """
     terms, none = dict(constraint.terms), jnp.zeros_like(physical["B1"])
     weight, margin = terms.pop("K1"), MARGIN * (K1.high - K1.low)
     others = functools.reduce(jnp.add, (each * physical[name] for name, each in terms.items()), none)
@@ -145,7 +161,7 @@ def _within(constraint: Constraint, K1: Parameter, physical: Mapping[str, _Batch
 def _K1_of(
     span: Span, damping: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""], T: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """K1 with this effective damping; inf or 0 if there is none."""
+    """K1 (N/mm) with this effective `damping` (N·s/m); inf if no K1 reaches it, 0 for a damping of 0."""
     beta, kernel_sums = pot_stiffness(B1, alpha, T), sums(alpha, span)
     square = damping / (1000 * T * beta * kernel_sums.moment)
     possible = (square > 0) & (square < 1)
@@ -155,5 +171,5 @@ def _K1_of(
 
 
 def _model_parameters(physical: _Physical) -> tuple[Any, Any, Any]:
-    """K1, B1 and alpha."""
+    """K1, B1 and alpha of a mapping, as a tuple."""
     return physical["K1"], physical["B1"], physical["alpha"]

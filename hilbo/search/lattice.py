@@ -39,7 +39,8 @@ _SLACK = 16.0  # rounding errors of a mean, in units of eps times the sum of its
 class OptimisticScore(Protocol):
     """Score of posterior means and variances that has an upper bound over variances."""
 
-    def __call__(self, mean: Float[Array, "..."], variance: Float[Array, "..."], /) -> Float[Array, "..."]: ...
+    def __call__(self, mean: Float[Array, "..."], variance: Float[Array, "..."], /) -> Float[Array, "..."]:
+        """Score of posterior means and variances, elementwise."""
 
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""], /) -> Float[Array, "..."]:
         """Upper bound of the score given the posterior mean, over variances from 0 to `prior`.
@@ -66,7 +67,7 @@ class Lattice(eqx.Module):
     dim: int = eqx.field(static=True)
 
     def points(self, row: Int[Array, "*k"], column: Int[Array, "*k"]) -> Float[Array, "*k d"]:
-        """Points (..., d) of the unit cube; `row` counts the nodes of a column, then its ends."""
+        """Points (..., d) of the unit cube in these rows and columns; rows are a column's nodes, then its ends."""
         count = self.nodes.shape[0]
         at_node = self.nodes[jnp.minimum(row, count - 1)]
         height = at_node
@@ -79,7 +80,7 @@ class Lattice(eqx.Module):
         return jnp.stack(coordinates, axis=-1)
 
     def everywhere(self) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:
-        """All points (m, d), and the mask of the feasible ones."""
+        """All points (m, d) of nodes, ends and extra points, and the mask (m,) of the feasible ones."""
         usable = jnp.concatenate([self.inside, self.present])
         of_lattice = self.points(*jnp.indices(usable.shape)).reshape(-1, self.dim)
         points = jnp.concatenate([of_lattice, self.extra.astype(of_lattice.dtype)])
@@ -114,8 +115,9 @@ def screen(
 ) -> Screened:
     """Maximise a score over a lattice, and return starting points for local searches.
 
-    **Arguments:** the `kernel`, observed points `x` (n, d), `weights` and `factor` of a posterior; `allowed`: which
-    points may be chosen, e.g. none too close to earlier ones.
+    **Arguments:** the `kernel`, observed points `x` (n, d), `weights` and `factor` of a posterior, with mean k'weights
+    and variance k(x, x) - |factor k|² for the prior covariances k with `x`; `allowed`: further condition on a point,
+    e.g. not too close to earlier ones.
     """
     usable, may = jnp.concatenate([lattice.inside, lattice.present]), jnp.ones(lattice.extra.shape[:1], bool)
     if allowed is not None:
@@ -150,7 +152,7 @@ class _Found(NamedTuple):
 
 
 def _best_first(columns: "_Columns", highest: Float[Array, ""]) -> _Found:
-    """Evaluate columns in the order of their bounds, while they may contain a value above `highest`."""
+    """Evaluate columns in the order of their bounds, while they may contain a value above `highest`; final state."""
 
     def step(state):
         _, chosen = jax.lax.top_k(state.bounds, min(_BATCH, state.bounds.shape[0]))
@@ -173,16 +175,19 @@ def _best_first(columns: "_Columns", highest: Float[Array, ""]) -> _Found:
 
 
 def _first_largest(values: Float[Array, "r *c"]) -> Int[Array, "*c"]:
-    """`argmax` down the first axis; XLA makes faster code of a maximum and a minimum than of one `argmax`."""
+    """Index of the first maximum along the first axis, as `argmax`.
+
+    XLA makes faster code of a maximum and a minimum than of one `argmax`.
+    """
     last = values.shape[0] - 1
     index = jnp.arange(last + 1, dtype=jnp.int32).reshape(-1, *[1] * (values.ndim - 1))
     return jnp.min(jnp.where(values == jnp.max(values, axis=0, keepdims=True), index, last), axis=0)
 
 
 class _Columns(eqx.Module):
-    """Prior covariances between observed points and nodes, factorised along and across columns; usable nodes.
+    """Prior covariances between observed points and nodes, as factors along (`down`) and across columns, and at `ends`.
 
-    Scores.
+    `usable`: which nodes and ends may be chosen; `values`: the score.
     """
 
     down: Float[Array, "g n"]
@@ -192,7 +197,7 @@ class _Columns(eqx.Module):
     values: "_Values"
 
     def bounds(self) -> Float[Array, " c"]:
-        """Upper bound of the score in each column."""
+        """Upper bound of the score in each column, over its usable points; -inf if it has none."""
         weights = self.values.weights
         at_nodes = (self.down * weights[None, :]) @ self.across
         at_ends = weights @ (self.across[:, None, :] * self.ends).reshape(len(weights), -1)
@@ -200,7 +205,7 @@ class _Columns(eqx.Module):
         return jnp.max(jnp.where(self.usable, self.values.bound(mean), -jnp.inf), axis=0)
 
     def evaluate(self, chosen: Int[Array, " b"]) -> tuple[Float[Array, "r b"], Float[Array, "r b"]]:
-        """Values and hopes at the nodes and ends of the `chosen` columns."""
+        """Values and hopes (r, b) at the nodes and ends of the `chosen` columns (indices); -inf for unusable points."""
         across = self.across[:, chosen][:, None, :]
         cross = jnp.concatenate([self.down.T[:, :, None] * across, self.ends[:, :, chosen] * across], axis=1)
         scores = self.values(cross.reshape(len(cross), -1))
@@ -217,7 +222,11 @@ def screen_points(
     score: OptimisticScore,
     batch: int = 512,
 ) -> Float[Array, " m"]:
-    """Values (m,) of a score at arbitrary points; -inf at points that cannot be the maximum and were not evaluated."""
+    """Values (m,) of a score at arbitrary points, enough of them to contain the maximum.
+
+    -inf at points that cannot be the maximum and were not evaluated. Arguments as in `screen`; `batch`: points
+    evaluated at once.
+    """
     value_of = _Values(kernel.diagonal(x[0]), factor, weights, score)
 
     def evaluate(state):
@@ -233,7 +242,7 @@ def screen_points(
 
 
 class _Values(eqx.Module):
-    """Score as a function of the prior covariances `cross` with the observed points."""
+    """Score as a function of the prior covariances with the observed points; `prior`: variance of the prior."""
 
     prior: Float[Array, ""]
     factor: Float[Array, "n n"]
@@ -246,7 +255,7 @@ class _Values(eqx.Module):
         return self.score.optimistic(mean + slack, self.prior)
 
     def __call__(self, cross: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Values and hopes at the columns of `cross`; -inf if the score is not a number."""
+        """Values and hopes (m,) for prior covariances `cross`; -inf if the score is not a number."""
         product = jnp.concatenate([self.factor, self.weights[None, :]]) @ jax.lax.optimization_barrier(cross)
         mean, left = product[-1], self.prior - jnp.sum(product[:-1] ** 2, axis=0)
         # Rounding may leave less than nothing of a variance, and these numbers only rank; what is none ranks last.
@@ -259,7 +268,11 @@ class _Values(eqx.Module):
 def _factors(
     kernel: RBF, x: Float[Array, "n d"], lattice: Lattice
 ) -> tuple[Float[Array, "g n"], Float[Array, "n c"], Float[Array, "n e c"]]:
-    """Covariances as products: (g, n) along the columns, (n, c) across them, and (n, e, c) at their ends."""
+    """Covariances between observed points and lattice as products of factors along and across the columns.
+
+    (g, n) along them at the nodes, (n, c) across them, with the kernel's variance, and (n, e, c) along them at the
+    ends.
+    """
     nodes, ends = lattice.nodes.astype(x.dtype), lattice.ends.astype(x.dtype)
     across = kernel.diagonal(x[0]) * jnp.ones_like(x[:, :1])
     for i in range(lattice.dim):

@@ -37,7 +37,10 @@ class Walls(NamedTuple):
 
 
 def rows_of(parameters: Sequence[Parameter], constraints: Sequence[Constraint], without: str | None = None) -> Walls:
-    """Constraints as walls in linear units of the ranges, except those that involve the parameter `without`."""
+    """Constraints as walls in coordinates that run linearly from 0 to 1 over each range, `MARGIN` inside.
+
+    One wall for each `least` and each `most`; constraints that involve the parameter `without` are left out.
+    """
     names, low = [p.name for p in parameters], np.array([p.low for p in parameters])
     width = np.array([p.high for p in parameters]) - low
     normals, offsets, source = [], [], []
@@ -85,7 +88,10 @@ def _ordinal(number: int) -> str:
 
 
 def _radius(walls: Walls) -> tuple[float, Float[np.ndarray, " d"]]:
-    """Radius and centre of the largest ball between the walls within the cube; radius below 0 if there is none."""
+    """Radius and centre (d,) of the largest ball between the walls within the cube.
+
+    The radius is below 0 if no point is between them.
+    """
     from scipy.optimize import linprog  # slow to import, and only studies with constraints need it
 
     normals, offsets = _with_cube(walls)
@@ -105,7 +111,10 @@ def _with_cube(walls: Walls) -> tuple[Float[np.ndarray, "r d"], Float[np.ndarray
 
 
 def inside(walls: Walls, count: int, seed: int) -> Iterator[Float[np.ndarray, "n d"]]:
-    """Yield chunks of at least `count` points, uniform between the walls within the cube, by hit and run."""
+    """Yield without end chunks of `count` points or more, uniform between the walls within the cube, by hit and run.
+
+    There must be room (`check_room`).
+    """
     rng, (_, middle) = np.random.default_rng(seed), _radius(walls)
     w = np.tile(middle, (_CHAINS, 1))
     for _ in range(_BURN_IN):
@@ -120,14 +129,17 @@ def inside(walls: Walls, count: int, seed: int) -> Iterator[Float[np.ndarray, "n
 
 
 def _hit(walls: Walls, w: Float[np.ndarray, "n d"], rng: np.random.Generator) -> Float[np.ndarray, "n d"]:
-    """One step of hit and run: a uniform point on a random line through each point."""
+    """One step of hit and run: from each point to a uniform point on a random line through it, between the walls."""
     direction = rng.standard_normal(w.shape)
     ahead, behind = (_distance_to_wall(*_with_cube(walls), w, side * direction)[0] for side in (1.0, -1.0))
     return w + (rng.random(len(w)) * (ahead + behind) - behind)[:, None] * direction
 
 
 def _distance_to_wall(normals, offsets, w, direction) -> tuple[Float[np.ndarray, " n"], np.ndarray]:
-    """Distance from each point to the boundary in its direction, and the row of the wall there."""
+    """Distance from each point, in units of `direction`, to the first wall ahead, and that wall's row.
+
+    Infinite, with row 0, if none is ahead.
+    """
     speed, left = direction @ normals.T, np.maximum(offsets - w @ normals.T, 0.0)
     moving = speed > 1e-12
     lengths = np.where(moving, left / np.where(moving, speed, 1.0), np.inf)

@@ -20,7 +20,7 @@ __all__ = ["K0_range", "Rendering", "delay_words", "derived_of"]
 class Rendering:
     """A point of a search space in physical units; made by `of` and `at`.
 
-    `values`: parameter -> number in its unit, of a level its place in the list, in the order of the space. K0 and the
+    `values`: parameter -> number in its unit (position in the list for a level), in the order of the space. K0 and the
     passivity margin are computed once, when either is read.
     """
 
@@ -29,8 +29,7 @@ class Rendering:
 
     @classmethod
     def of(cls, space: SearchSpace, physical: Mapping[str, float] | Float[Any, " d"]) -> "Rendering":
-        """From physical values: by name, of which those that are no parameters are left out, or (d,) in the order of
-        the space."""
+        """From physical values: (d,) in the order of the space, or by name; other names are ignored."""
         if not isinstance(physical, Mapping):
             physical = dict(zip(space.names, np.asarray(physical).tolist(), strict=True))
         return cls(space, {name: float(physical[name]) for name in space.names})
@@ -47,11 +46,12 @@ class Rendering:
 
     @property
     def unit(self) -> Float[np.ndarray, " d"]:
-        """Its point (d,) of the unit cube."""
+        """The point (d,) of the unit cube."""
         return np.asarray(self.space.to_unit(self.point))
 
     @cached_property
     def _derived(self) -> tuple[dict[str, float], float | None]:
+        """K0 (N/mm) by name, and the passivity margin (N·s/m), computed at first use; {} and None without mechanics."""
         if self.space.mechanics is None:
             return {}, None
         K0, margin = np.asarray(_program(self.space)((self.point,))).tolist()
@@ -59,12 +59,12 @@ class Rendering:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The values, and K0 (N/mm) where the space has mechanics: what logs hold and devices render."""
+        """Physical values by name, with K0 (N/mm) if the space has mechanics; as logs store and devices render them."""
         return self.values | self._derived[0]
 
     @property
     def shown(self) -> dict[str, Any]:
-        """K0 and the values as tables hold them: levels by their names, whole numbers as such."""
+        """K0, if the space has mechanics, and the values as in tables: levels by name, whole numbers as int."""
         return self._derived[0] | {p.name: p.shown(self.values[p.name]) for p in self.space.parameters}
 
     @property
@@ -76,13 +76,16 @@ class Rendering:
 def derived_of(
     space: SearchSpace, physical: Float[Array, "*batch d"]
 ) -> tuple[dict[str, Float[Array, "*batch"]], Float[Array, "*batch"] | None]:
-    """K0 (N/mm) by name and the passivity margin (N·s/m) of physical values, last axis = parameter; {} and None without
-    mechanics. Traceable."""
+    """K0 (N/mm) by name and passivity margin (N·s/m) of physical values (..., d); {} and None without mechanics.
+
+    Can be traced by JAX.
+    """
     values = {name: physical[..., i] for i, name in enumerate(space.names)}
     return space.derived(values), space.passivity_margin(values)
 
 
 def _K0_and_margin(space: SearchSpace, physical: Float[Array, " d"]) -> Float[Array, "2"]:
+    """K0 (N/mm) and the passivity margin (N·s/m) of a physical point (d,), as (2,); for a space with mechanics."""
     derived, margin = derived_of(space, physical)
     assert margin is not None  # only asked for with mechanics
     return jnp.stack([derived["K0"], margin])
@@ -90,12 +93,12 @@ def _K0_and_margin(space: SearchSpace, physical: Float[Array, " d"]) -> Float[Ar
 
 @lru_cache(maxsize=16)
 def _program(space: SearchSpace) -> OfArrays:
-    """`_K0_and_margin` of a space, compiled; as a function of the point alone, since a live session waits for it."""
+    """`_K0_and_margin` of a space, compiled once, as a function of [point]. Fast, since a live session waits for it."""
     return prepared(_K0_and_margin, space, np.zeros(space.dim))
 
 
 def delay_words(space: SearchSpace) -> str:
-    """The passive share of the box with and without the delay of the device's force; empty without a delay."""
+    """Text with the passive percentage of the box at the device's delay and without it; "" without a delay."""
     if space.mechanics is None or not space.mechanics.delay:
         return ""
     late, prompt = (100 * each.volume() for each in (space, space.without_delay()))
@@ -104,9 +107,10 @@ def delay_words(space: SearchSpace) -> str:
 
 
 def K0_range(space: SearchSpace) -> float:
-    """N/mm, from the K0 at the box's most elastic corner to K_eff, by which errors of K0 are normalised.
+    """Range of K0 (N/mm), from its value at the box's most elastic corner to K_eff, by which its errors are normalised.
 
-    16.14 for the paper's study: from -15.70 to 0.44 (paper, table I).
+    The corner has the highest K1 and B1 and the lowest alpha. 16.14 for the paper's study: from -15.70 to 0.44 (paper,
+    table I). The space must have mechanics.
     """
     ends = {p.name: p.low if p.name == "alpha" else p.high for p in space.parameters}
     assert space.mechanics is not None

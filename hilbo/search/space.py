@@ -83,12 +83,15 @@ class SearchSpace(eqx.Module):
 
     @property
     def even(self) -> bool:
-        """Whether the space is a plain box, or the passive part of one, of continuous parameters."""
+        """Whether all parameters are continuous and there are no constraints; mechanics are allowed."""
         return not self.constraints and not any(self.discrete)
 
     @property
     def searched(self) -> dict[str, Any]:
-        """Keyword arguments that describe this space to `acquisition.maximise`."""
+        """Keyword arguments of `acquisition.maximise` that describe this space: coordinate maps, `feasible`, and walls.
+
+        Walls, discrete coordinates and their neighbours only where the space is not `even`.
+        """
         functions = {"from_box": self.from_box, "to_box": self.to_box, "feasible": self.feasible}
         if self.even:
             return functions
@@ -102,7 +105,7 @@ class SearchSpace(eqx.Module):
 
     @property
     def columns(self) -> Columns | None:
-        """Columns along K1 with mechanics, else None."""
+        """Columns along K1, with the constraints that involve K1; None without mechanics."""
         if self.mechanics is None:
             return None
         on_K1 = (c for c in self.constraints if any(name == "K1" and weight for name, weight in c.terms))
@@ -121,18 +124,21 @@ class SearchSpace(eqx.Module):
 
     @property
     def _walls(self) -> linear.Walls:
-        """Walls of the constraints in box coordinates, except those on K1, which bound its column instead."""
+        """Walls of the constraints in box coordinates; with mechanics, those on K1 bound its column instead."""
         return linear.rows_of(self.parameters, self.constraints, None if self.mechanics is None else "K1")
 
     @property
     def _linear(self) -> tuple[bool, ...]:
-        """Mask of the parameters that are linear in the box, and logarithmic in the unit cube."""
+        """Mask of the parameters that are linear in the box, for a constraint, but logarithmic in the unit cube."""
         named = {name for constraint in self.constraints for name, weight in constraint.terms if weight}
         named -= set() if self.mechanics is None else {"K1"}
         return tuple(p.name in named and p.scale == "log" for p in self.parameters)
 
     def _check_axis(self, points: Any) -> None:
-        """Raise `InputError` for points with another number of coordinates, which JAX would accept silently."""
+        """Raise `InputError` unless the last axis of the points has one coordinate per parameter.
+
+        JAX would silently accept another number.
+        """
         shape = np.shape(points)
         if not shape or shape[-1] != self.dim:
             raise InputError(
@@ -172,7 +178,10 @@ class SearchSpace(eqx.Module):
         return w if self.columns is None else self.columns.from_shares(w)
 
     def to_box(self, x: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
-        """Inverse of `from_box`, for `x` in the feasible set. (..., d) -> (..., d)."""
+        """Inverse of `from_box`, for `x` in the feasible set. (..., d) -> (..., d).
+
+        In a column without a feasible point the coordinate of K1 is not finite.
+        """
         self._check_axis(x)
         x = _on_device(x)
         w = x
@@ -181,9 +190,9 @@ class SearchSpace(eqx.Module):
         return w if self.columns is None else self.columns.to_shares(w, x)
 
     def feasible(self, x: Real[ArrayLike, "*batch d"]) -> Bool[Array, "*batch"]:
-        """Whether points of the unit cube are in the box, passive with the search margin, and within all constraints.
+        """Whether points of the unit cube are in it, passive with the search margin, and within all constraints.
 
-        Including the range of effective damping. Discrete parameters are rounded first. (..., d) -> (...,).
+        The range of effective damping counts too. Discrete parameters are rounded first. (..., d) -> (...,).
         """
         self._check_axis(x)
         plain = self.mechanics is None and not self.constraints
@@ -199,7 +208,10 @@ class SearchSpace(eqx.Module):
         return inside
 
     def broken(self, x: Real[ArrayLike, " d"]) -> Bound | None:
-        """Name of the boundary that a point (d,) of the unit cube violates; None if it is feasible."""
+        """Boundary that a point (d,) of the unit cube violates; None if it violates none.
+
+        Constraints are reported first, then passivity, then effective damping. The ends of the ranges are not checked.
+        """
         physical = self._split(self.to_physical(_on_device(x)))
         if not all(keeps(constraint, physical) for constraint in self.constraints):
             return "constraint"
@@ -222,11 +234,14 @@ class SearchSpace(eqx.Module):
         return None if self.mechanics is None else self.mechanics.damping - minimum_damping(self.mechanics, physical)
 
     def volume(self) -> float:
-        """Passive fraction of the unit cube: the mean width of its columns, on a grid; 1 without mechanics."""
+        """Passive fraction of the unit cube: the mean width of its columns, on a grid; 1 without mechanics.
+
+        The range of effective damping counts too, constraints do not.
+        """
         return 1.0 if self.mechanics is None else volume(self._passive)
 
     def without_delay(self) -> "SearchSpace":
-        """The space for a force without delay; itself if it has none."""
+        """The same space with a delay of 0; the space itself if it has none."""
         if self.mechanics is None or not self.mechanics.delay:
             return self
         return dataclasses.replace(self, mechanics=dataclasses.replace(self.mechanics, delay=0.0))
@@ -234,7 +249,8 @@ class SearchSpace(eqx.Module):
     def candidates(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points of the unit cube, uniform over the feasible set with low discrepancy (scrambled Sobol').
 
-        -> (m, d).
+        -> (m, d), the same for the same seed. In a very small set between constraints they are random (hit and run).
+        Raises `InputError` if too few points are feasible.
         """
         if self.constraints and self.mechanics is None:
             return _take_between(self, m, seed)
@@ -243,7 +259,7 @@ class SearchSpace(eqx.Module):
     def walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points on the boundary of the feasible set (walls, edges, corners), including the passivity boundary.
 
-        -> (m, d).
+        -> (m, d), in the unit cube. Raises `InputError` if too few points are feasible.
         """
         if self.constraints and self.mechanics is None:
             return self._on_walls(m, seed)
@@ -255,39 +271,45 @@ class SearchSpace(eqx.Module):
         """`n` feasible points of the unit cube: a Latin hypercube in the coordinates in which the set is uniform.
 
         Points that fall outside the feasible set (a few, at the foot of infeasible columns) are replaced from further
-        hypercubes, at the price of the even spread. Between the walls of constraints the points are those nearest to
-        the centres of `n` clusters of many.
-        -> (n, d).
+        hypercubes, at the price of the even spread. With constraints they are no hypercube, but the points nearest to
+        the centres of `n` clusters of many. -> (n, d). Raises `InputError` if too few points are feasible.
         """
         if self.constraints and n:
             return spread_out(self.candidates(_CLUSTERED * n, seed), n, seed)
         return _take_feasible(self, n, latin_chunks(self.dim, n, seed), self._drawn)
 
     def _on_walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
-        """Points (m, d) on the walls of the constraints and of the cube, for a space without mechanics."""
+        """Points (m, d) on the walls of the constraints and of the cube, for a space without mechanics.
+
+        If rounding makes such a point infeasible, the interior point it was found from takes its place.
+        """
         starts, free = self.candidates(m, seed + 1), ~np.array(self.discrete)
         ends = linear.ends_of_rays(self._walls, np.asarray(_to_box(self, starts)), free, seed, HELD)
         x, feasible = _from_box(self, ends)
         return np.where(np.asarray(feasible)[:, None], np.asarray(x), starts)
 
     def _split(self, physical: Float[Array, "*batch d"]) -> dict[str, Float[Array, "*batch"]]:
-        """Coordinates by parameter name."""
+        """Coordinates by parameter name, each (...,)."""
         return {name: physical[..., i] for i, name in enumerate(self.names)}
 
 
 def _on_device(x: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
+    """The values as a JAX array of floating-point numbers."""
     return to_device(x, jnp.result_type(1.0, x))
 
 
 @functools.lru_cache(maxsize=16)
 def share_of_cube(space: SearchSpace) -> float:
-    """Feasible fraction of the unit cube, estimated from 4096 points."""
+    """Feasible fraction of the unit cube, estimated from 4096 points; cached."""
     points = next(sobol_chunks(space.dim, _PILOT, 0))
     return float(np.asarray(_feasible(space, steps_of(space.parameters, points))).mean())
 
 
 def _take_between(space: SearchSpace, count: int, seed: int) -> Float[np.ndarray, "count d"]:
-    """Draw `count` uniform feasible points of the unit cube, with constraints and without mechanics."""
+    """Draw `count` uniform feasible points of the unit cube, with constraints and without mechanics.
+
+    By rejection, or by hit and run if less than 2 % of the cube is feasible. Raises `InputError` for too few.
+    """
     chunks = sobol_chunks(space.dim, count, seed)
     if share_of_cube(space) < _ROOMY:
         chunks = (np.asarray(_from_box(space, w)[0]) for w in linear.inside(space._walls, count, seed))
@@ -301,16 +323,19 @@ def _take_between(space: SearchSpace, count: int, seed: int) -> Float[np.ndarray
 
 @program
 def _feasible(space: SearchSpace, x: Float[ArrayLike, "n d"]) -> Bool[Array, " n"]:
+    """`SearchSpace.feasible`, compiled."""
     return space.feasible(x)
 
 
 @program
 def _to_box(space: SearchSpace, x: Float[ArrayLike, "n d"]) -> Float[Array, "n d"]:
+    """`SearchSpace.to_box`, compiled."""
     return space.to_box(x)
 
 
 @program
 def _from_box(space: SearchSpace, w: Float[ArrayLike, "n d"]) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
+    """`SearchSpace.from_box`, compiled: points of the unit cube, and whether each is feasible."""
     x = space.from_box(w)
     return x, space.feasible(x)
 
@@ -319,7 +344,7 @@ def _from_box(space: SearchSpace, w: Float[ArrayLike, "n d"]) -> tuple[Float[Arr
 def _from_columns(
     space: SearchSpace, columns: Columns, w: Float[ArrayLike, "n d"]
 ) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
-    """Points of the unit cube but for K1, which is a share of its column."""
+    """Points of the unit cube from `w`, whose K1 is a share of its column, and whether each is feasible; compiled."""
     x = columns.from_shares(_on_device(w))
     return x, space.feasible(x)
 
@@ -327,9 +352,10 @@ def _from_columns(
 def _take_feasible(
     space: SearchSpace, count: int, chunks: Chunks, columns: Columns | None, hold: Chunks | None = None
 ) -> Float[np.ndarray, "count d"]:
-    """Take the first `count` feasible points out of chunks of uniform numbers.
+    """Take the first `count` feasible points out of chunks of uniform numbers; points of the unit cube.
 
-    K1 is within `columns`; `hold`: chunks with the coordinates that are fixed at an end.
+    `columns`: K1 is drawn within them; None: points are drawn in the box coordinates. `hold`: chunks of the same sizes
+    with the coordinates that are fixed at an end, NaN for free ones. Raises `InputError` for too few.
     """
 
     def place(uniform):
@@ -347,7 +373,7 @@ def _take_feasible(
 def _joined(
     space: SearchSpace, count: int, kept: list[Float[np.ndarray, "_ d"]], taken: int, tried: int
 ) -> Float[np.ndarray, "count d"]:
-    """Concatenate the points. Raises `InputError` for fewer than `count`."""
+    """Concatenate the arrays of points in `kept`. Raises `InputError` if `taken` is fewer than `count` (of `tried`)."""
     if taken < count:
         left = f"{taken} of {tried} {'points' if space.mechanics is None else 'passive points'}, too few to search"
         if space.constraints:

@@ -22,10 +22,10 @@ HELD = (0.7, 0.2, 0.1)  # shares of the wall points with one, two and three coor
 def take(
     count: int, chunks: Chunks, place: Callable[[np.ndarray], tuple[Float[np.ndarray, "n d"], Bool[np.ndarray, " n"]]]
 ) -> tuple[list[Float[np.ndarray, "_ d"]], int, int]:
-    """Take the first `count` usable points, in parts; also return how many were found, and how many were tried.
+    """Take the first `count` usable points from `chunks`, in parts; with the number found and the number tried.
 
     `place` converts a chunk into points and a mask of the usable ones. Fewer than `count` are found only if less than
-    `LEAST_SHARE` is usable.
+    `LEAST_SHARE` is usable; that raises nothing.
     """
     kept, usable_count, tried = [], 0, 0
     while usable_count < count and not (tried > 10 / LEAST_SHARE and usable_count < LEAST_SHARE * tried):
@@ -36,7 +36,7 @@ def take(
 
 
 def sobol_chunks(dim: int, count: int, seed: int) -> Chunks:
-    """Scrambled Sobol' points, about `count` in the first chunk."""
+    """Yield without end scrambled Sobol' points in chunks; the first has `count`, rounded up to a power of 2."""
     from scipy.stats import qmc  # slow to import, and only this module needs it
 
     engine = qmc.Sobol(dim, rng=np.random.default_rng(seed))
@@ -45,7 +45,7 @@ def sobol_chunks(dim: int, count: int, seed: int) -> Chunks:
 
 
 def latin_chunks(dim: int, count: int, seed: int) -> Chunks:
-    """Latin hypercubes, the first of `count` points."""
+    """Yield without end Latin hypercubes of growing size, each a chunk (n, dim); the first has `count` points."""
     rng = np.random.default_rng(seed)
     for size in _sizes(max(count, 1)):
         strata = rng.permuted(np.tile(np.arange(size), (dim, 1)), axis=1).T
@@ -53,7 +53,10 @@ def latin_chunks(dim: int, count: int, seed: int) -> Chunks:
 
 
 def wall_chunks(dim: int, count: int, seed: int) -> Chunks:
-    """Fixed coordinates of boundary points: 0 or 1 for one or more random coordinates of a point, NaN for free ones."""
+    """Yield without end chunks that fix coordinates of points: 0 or 1 for one or more random ones, NaN for the others.
+
+    `HELD` holds the shares of points with one, two and three fixed coordinates. The first chunk has `count` rows.
+    """
     rng = np.random.default_rng(seed)
     shares = np.array(HELD[:dim]) / sum(HELD[:dim])
     for size in _sizes(max(count, 1)):
@@ -64,7 +67,10 @@ def wall_chunks(dim: int, count: int, seed: int) -> Chunks:
 def crossings(
     table: Float[np.ndarray, "l p"], positions: Float[np.ndarray, " p"], levels: Float[np.ndarray, " v"]
 ) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Where a function, tabulated along each of l lines, crosses levels: the line, and the interpolated position."""
+    """Where a function, tabulated along each of l lines at `positions`, crosses `levels`.
+
+    Returns the index of the line and the linearly interpolated position of each crossing, (c,) each.
+    """
     above = table[:, :, None] >= levels[None, None, :]
     line, before, level = np.nonzero(above[:, 1:] != above[:, :-1])
     left, right = table[line, before], table[line, before + 1]
@@ -92,7 +98,7 @@ def spread_out(points: Float[np.ndarray, "m d"], count: int, seed: int) -> Float
 
 
 def _sizes(size: int) -> Iterator[int]:
-    """Yield chunk sizes, growing by a factor of 16 up to a limit."""
+    """Yield without end chunk sizes: `size`, then each 16 times the last, up to a limit."""
     while True:
         yield size
         size = max(size, min(16 * size, _LARGEST_CHUNK))

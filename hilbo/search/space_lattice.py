@@ -20,7 +20,10 @@ __all__ = ["lattice_of"]
 
 @functools.lru_cache(maxsize=16)
 def lattice_of(space: SearchSpace, nodes: int) -> Lattice:
-    """Lattice of a space with `nodes` per coordinate; without mechanics its columns run along the first parameter."""
+    """Lattice of an `even` space with `nodes` per coordinate, cached; with mechanics, of K1, B1 and alpha alone.
+
+    Its columns run along K1; without mechanics along the first parameter, and all points are feasible.
+    """
     even, dim = np.linspace(0.0, 1.0, nodes), space.dim
     if space.mechanics is None:
         none = np.zeros((0, nodes ** (dim - 1)))
@@ -62,7 +65,10 @@ def _steep_wall(space, levels):
 
 
 def _ends_of(space, points):
-    """Both ends of the columns of points, evaluated in batches of the table's size, so that nothing is recompiled."""
+    """Lower and upper ends (n,) of the columns of points (n, d), in x_K1.
+
+    Evaluated in batches of the table's size, so that nothing is compiled again.
+    """
     shape = (len(ROWS), len(COLUMNS), space.dim)
     parts = []
     for begin in range(0, len(points), shape[0] * shape[1]):

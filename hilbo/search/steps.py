@@ -15,10 +15,10 @@ Parameters = tuple[Parameter, ...]
 
 
 def neighbours(parameters: Parameters, coupled: bool, x: Float[Array, " d"]) -> Float[Array, "k d"]:
-    """Points (k, d) of the unit cube that differ from `x` by a step of one discrete parameter.
+    """Points (k, d) of the unit cube that differ from `x` by a step of one discrete parameter; there must be one.
 
-    Whole numbers change by 1, 2, 4, ..., levels to every other. If constraints are `coupled`, also pairs of whole
-    numbers, each by 1.
+    Whole numbers change by ±1, ±2, ±4, ..., limited to the range, levels to every other. If `coupled`, also pairs of
+    whole numbers, each by ±1.
     """
     values = [p.to_physical(x[i]) for i, p in enumerate(parameters)]
     changes = list(_changes(parameters, values))
@@ -36,7 +36,7 @@ def neighbours(parameters: Parameters, coupled: bool, x: Float[Array, " d"]) -> 
 
 
 def _changes(parameters: Parameters, values: list[Float[Array, ""]]) -> Iterator[dict[int, Float[Array, ""]]]:
-    """Yield for every step of one parameter its index and new physical value."""
+    """Yield for every step of one discrete parameter a dict of its index and new physical value."""
     for i, p in enumerate(parameters):
         if p.levels:
             yield from ({i: (values[i] + step) % p.steps} for step in range(1, p.steps))
@@ -46,12 +46,15 @@ def _changes(parameters: Parameters, values: list[Float[Array, ""]]) -> Iterator
 
 
 def _moved(p: Parameter, value: Float[Array, ""], by: int) -> Float[Array, ""]:
-    """Value changed by `by`, limited to the range."""
+    """Physical value changed by `by`, limited to the range of the parameter."""
     return jnp.clip(value + by, p.low, p.high)
 
 
 def steps_of(parameters: Parameters, uniform: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """Uniform numbers as points of the unit cube; discrete parameters are rounded to steps of equal probability."""
+    """Uniform numbers (n, d) as points of the unit cube: discrete parameters become steps of equal probability.
+
+    The array itself is returned if no parameter is discrete.
+    """
     if not any(p.discrete for p in parameters):
         return uniform
     x = uniform.copy()
