@@ -11,8 +11,9 @@ _OFF_ZERO, _MOVED = 0.03, 0.2  # of a curve's range
 def untared(applied: Float[np.ndarray, " m"], measured: Float[np.ndarray, " m"]) -> str | None:
     """Name the channel with an untared offset, "input" or "output"; None if there is none.
 
-    That channel is clearly not 0 in its first row, while the other one is. A step in the first row looks the same, but
-    there the other channel moves while this one stays constant. `applied`, `measured`: (m,) each.
+    That channel is clearly not 0 in its first row, while the other one is 0. A step in the first row looks the same,
+    but there the other channel moves while this one stays constant. `applied` (the input), `measured` (the output):
+    (m,) each, in any unit.
     """
     name = off_zero(applied, measured)
     suspect, other = (applied, measured) if name == "input" else (measured, applied)
@@ -22,7 +23,10 @@ def untared(applied: Float[np.ndarray, " m"], measured: Float[np.ndarray, " m"])
 
 
 def off_zero(applied: Float[np.ndarray, " m"], measured: Float[np.ndarray, " m"]) -> str | None:
-    """Name the channel that is clearly not 0 in the first row while the other is 0, "input" or "output"; else None."""
+    """Name the channel that is clearly not 0 in its first row while the other one is 0.
+
+    "input" (`applied`) or "output" (`measured`), (m,) each in any unit; None if both or neither are 0.
+    """
     for name, values, other in (("input", applied, measured), ("output", measured, applied)):
         height = _height(values)
         zero = _height(other) <= max(0.1 * min(height, 1.0), 2 * _jitter(other))
@@ -32,7 +36,7 @@ def off_zero(applied: Float[np.ndarray, " m"], measured: Float[np.ndarray, " m"]
 
 
 def _height(values: Float[np.ndarray, " m"]) -> float:
-    """Absolute first value divided by the range of the values; inf for a constant that is not 0."""
+    """Absolute first value divided by the range of the values; for a constant inf, or 0 if it is 0."""
     first, width = abs(values[0]), np.ptp(values)
     return float(first / width) if width > 0 else np.inf if first > 0 else 0.0
 
@@ -49,6 +53,7 @@ def correlation(
     """Correlation about 0 (not about the mean) of two curves over time; nan if one of them is 0 throughout.
 
     The storage modulus of any material is positive at every frequency, so this is positive for any motion from rest.
+    `time` (m,) in s, increasing; the curves (m,) in any unit.
     """
     cross, applied_2, measured_2 = (
         np.trapezoid(product, time) for product in (applied * measured, applied * applied, measured * measured)

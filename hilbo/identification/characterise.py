@@ -61,9 +61,10 @@ def characterise(
 ) -> Characterisation:
     """Fit one parameter set to the tests; compute intervals, residual noise, minimum damping and warnings.
 
-    `choices`: memory lengths to compare (none: no comparison). `say` receives the name of each step for progress
-    output. `find_filter`: a `Sampled` with `lag="fit"` and no filter is fitted with one if the residuals indicate it
-    (`misfit`).
+    `model`: a `fitting.Model`; `seed` of the bootstrap and of quantiles. `choices`: memory lengths (None: full memory)
+    to compare, in further fits; empty: no comparison. `say` receives the name of each step for progress output.
+    `find_filter`: a `Sampled` with `lag="fit"` and no filter is fitted with one if the residuals indicate it
+    (`misfit`). The fit in the result is that of the model finally used. Raises `InputError` as `fitting.fit`.
     """
     say("fitting")
     best_fit, sides = _fitted(tests, model, say, find_filter)
@@ -92,7 +93,8 @@ def _fitted(
 ) -> tuple[Fit, intervals.Intervals]:
     """Best fit and its profile intervals; lag and filter are fitted if the model asks for it and the data allow it.
 
-    The fit is restarted up to three times from a better point that the interval search came across.
+    If no input has a significant change, a lag of 0 is taken in place of a fitted one. The fit is restarted up to three
+    times from a better point that the interval search came across. `say` receives the name of each step.
     """
     fits_lag = isinstance(model, Sampled) and model.lag == "fit"
     if fits_lag and not can_be_timed(tests):
@@ -114,7 +116,7 @@ def _fitted(
 
 
 def _instrument(best_fit: Fit) -> tuple[float, float]:
-    """Lag (s) and filter corner (Hz) of a fit, to be kept fixed in fits with other memories."""
+    """Lag (s) and filter corner (Hz) of a fit of `Sampled`, fitted or given, to be kept fixed in other fits."""
     model = best_fit.model
     named = dict(zip(model.labels, np.asarray(model.natural(best_fit.q)).tolist(), strict=True))
     lag = 1e-3 * named["lag"] if "lag" in named else float(model.lag)
@@ -122,9 +124,10 @@ def _instrument(best_fit: Fit) -> tuple[float, float]:
 
 
 def _estimates(best_fit: Fit, sides: intervals.Intervals, sampling: intervals.Spread, seed: int) -> dict[str, Estimate]:
-    """Estimates of all parameters and coordinates by name.
+    """Estimates by name: of the parameters that are no coordinates, then of the coordinates.
 
-    Coordinates have profile intervals, the other parameters quantiles.
+    Coordinates have profile intervals. The others have quantiles if all coordinates are identified; otherwise their
+    status is "not identifiable", without an interval.
     """
     model, labels, at_bound = best_fit.model, best_fit.model.labels, np.asarray(best_fit.held())
     open_lower, open_upper = np.asarray(sides.open_lower), np.asarray(sides.open_upper)
@@ -145,9 +148,10 @@ def _estimates(best_fit: Fit, sides: intervals.Intervals, sampling: intervals.Sp
 
 
 def _status(ok, open_lower, open_upper, at_bound) -> str:
-    """Status of an estimate, as defined in this module's docstring.
+    """Status of an estimate: "at bound", "not identifiable", "one-sided" or "identified".
 
-    `ok`: both interval searches and the fit converged; `at_bound`: the fit ended at a bound.
+    `ok`: both interval searches and the fit converged; `open_lower`, `open_upper`: the interval has no end there;
+    `at_bound`: the fit ended at a bound, which decides first.
     """
     if at_bound:
         return "at bound"
@@ -157,7 +161,7 @@ def _status(ok, open_lower, open_upper, at_bound) -> str:
 
 
 def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str, list[float]]:
-    """95 % intervals of the derived parameters, from normal draws of the coordinates."""
+    """95 % intervals (lower, upper) of the parameters by name, from normal draws of the coordinates."""
     rng = np.random.default_rng(seed)
     draws = rng.multivariate_normal(np.asarray(best_fit.q), np.asarray(sampling.covariance), _DRAWS, method="eigh")
     sets = jax.vmap(best_fit.model.parameters)(jnp.asarray(draws))
@@ -165,7 +169,11 @@ def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str
 
 
 def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
-    """Yield for each test the description of its residuals, and their size relative to the noise of the repeats."""
+    """Yield a dict for each test that describes the noise of its residuals.
+
+    "over_repeat_noise" is their RMS over the standard error of the mean of the repeats, in the test's own output;
+    missing for a single repeat and for identical ones.
+    """
     for test, curve, autoregression in zip(tests, best_fit.curves, noise(best_fit), strict=True):
         values = np.asarray(test.output if curve.other_way is None else test.input)
         row = {
@@ -185,9 +193,9 @@ def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
 
 
 def _minimum_damping(best_fit: Fit) -> float | None:
-    """Smallest device damping (N·s/m) with which the fitted set is passive.
+    """Smallest device damping (N·s/m) with which the fitted set is passive, without delay.
 
-    None for moduli, and for an even number of taps, where the closed form is too low.
+    None for a model of moduli, and for an even number of taps, where the closed form is too low.
     """
     model, values = best_fit.model, best_fit.parameters()
     if not isinstance(model, Sampled) or (model.memory == "short" and int(model.N) % 2 == 0):

@@ -68,7 +68,11 @@ class Test(eqx.Module):
         self._check_signs()
 
     def _check_signs(self):
-        """Raise `InputError` for a repeat whose position and force have opposite signs."""
+        """Raise `InputError` for a repeat whose position and force have opposite signs.
+
+        In equilibrium their changes from the first row count; with an offset in one channel both they and the values
+        must be opposite.
+        """
         for repeat, (applied, measured) in enumerate(
             zip(() if self.input is None else self.input, self.output, strict=False), 1
         ):
@@ -105,11 +109,11 @@ class Model(Protocol):
         ...
 
     def physical(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-        """Masks of the lower and upper bounds that are physical limits, such as stiffness 0. Two tuples (p,)."""
+        """Masks of the lower and of the upper bounds that are physical limits, such as stiffness 0. Two tuples (p,)."""
         ...
 
     def at(self, tests: Sequence[Test]) -> "Model":
-        """Copy of the model adapted to the times of the tests."""
+        """Copy of the model adapted to the tests, to be used for all following calls."""
         ...
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
@@ -129,7 +133,7 @@ class Model(Protocol):
         ...
 
     def natural(self, q: Array) -> Array:
-        """Coordinates q (p,) converted to the physical units of their labels."""
+        """Coordinates q (p,) converted to the physical units of their labels. (p,)."""
         ...
 
     def parameters(self, q: Array) -> dict[str, Array]:
@@ -165,7 +169,7 @@ class Curve(eqx.Module):
 
     @property
     def fitted(self) -> "Curve":
-        """The curve whose residuals are minimised: `other_way` if there is one, else this one."""
+        """The curve whose residuals are minimised: `other_way` if there is one, else this curve."""
         return self if self.other_way is None else self.other_way
 
 
@@ -198,8 +202,11 @@ class Fit(eqx.Module):
         weights: Sequence[Float[Array, " _"]] | None = None,
         **search: Any,
     ) -> Solution:
-        """Least squares from a `start` (p,), in the fit's box and under its weights or in others; `search` are options
-        of `least_squares`."""
+        """Least squares from a `start` (p,), in the fit's box and under its weights, unless others are given.
+
+        `box`: lower and upper bounds (p,); `weights` (R,) of the repeats of each curve; `search`: options of
+        `least_squares`. The fit itself is not changed.
+        """
         others = self.weights if weights is None else weights
         ends = (self.lower, self.upper) if box is None else box
         return least_squares(lambda q: residuals(self.model, self.curves, others, q), start, *ends, **search)
@@ -216,10 +223,10 @@ class Fit(eqx.Module):
 
 
 def fit(tests: Sequence[Test], model: Any) -> Fit:
-    """Fit one parameter set jointly to all tests.
+    """Fit one parameter set jointly to all tests, with equal weights of the repeats.
 
-    All starting points of the model take a few steps in one compiled call; the best one is iterated to convergence.
-    Raises `InputError` for no tests, and for tests that the model cannot predict.
+    All starting points of the model take a few steps in one compiled call; the best one is iterated to convergence, or
+    200 steps. Raises `InputError` for no tests, and for tests that the model cannot predict.
     """
     if not tests:
         raise InputError("There is no test to fit.")
@@ -235,7 +242,7 @@ def fit(tests: Sequence[Test], model: Any) -> Fit:
 
 
 def polish(fitted: Fit, start: Float[Array, " p"]) -> Fit:
-    """Refit from another starting point `start` (p,); return the better of the two fits."""
+    """Refit from another starting point `start` (p,); return the fit with the lower cost, which may be `fitted`."""
     again = _polished(fitted, start)
     better = again.cost < fitted.solution.cost
     return eqx.tree_at(lambda f: f.solution, fitted, again) if better else fitted
@@ -243,7 +250,7 @@ def polish(fitted: Fit, start: Float[Array, " p"]) -> Fit:
 
 @program
 def _polished(current: Fit, start: Float[Array, " p"]) -> Solution:
-    """Minimum found from the starting point `start` (p,)."""
+    """Minimum found from the starting point `start` (p,), for the data of the `current` fit; compiled."""
     return current.minimum(start, max_steps=_LONGEST)
 
 
@@ -257,7 +264,7 @@ def residuals(
 def curve_residuals(model: Any, curve: Curve, weights: Float[Array, " R"], q: Float[Array, " p"]) -> Float[Array, " m"]:
     """Residuals of one curve: (weighted mean of the repeats - prediction) / (scale·√m).
 
-    `weights` (R,), `q` (p,) -> (m,), dimensionless. A curve with `other_way` is compared in that form.
+    `weights` (R,), `q` (p,) -> (m,), dimensionless. A curve with `other_way` is replaced by that one.
     """
     return _misfit(model, curve.fitted, weights, q)
 
@@ -269,7 +276,10 @@ def _misfit(model: Any, curve: Curve, weights: Float[Array, " R"], q: Float[Arra
 
 
 def nrmse(fitted: Fit) -> dict[str, float]:
-    """NRMSE of each test in its own output: kind of test -> root mean square residual / range of the curve."""
+    """NRMSE of each test in its own output, by kind of test: root mean square residual / `scale` of the curve.
+
+    The scale is the range of the curve, or each value for moduli with relative weights.
+    """
     parts = [_misfit(fitted.model, c, w, fitted.q) for c, w in zip(fitted.curves, fitted.weights, strict=True)]
     return {c.kind: float(jnp.linalg.norm(r)) for c, r in zip(fitted.curves, parts, strict=True)}
 
@@ -283,8 +293,10 @@ def search(
     lower: Float[Array, " p"],
     upper: Float[Array, " p"],
 ) -> Solution:
-    """Run all starting points (s, p) for a few steps and iterate the best one to convergence, within the box `lower` to
-    `upper` (p,)."""
+    """Run all starting points (s, p) for a few steps and iterate the best one to convergence; compiled.
+
+    Within the box `lower` to `upper` (p,); `weights` (R,) of the repeats of each curve.
+    """
 
     def run(start, steps):
         return least_squares(lambda q: residuals(model, curves, weights, q), start, lower, upper, max_steps=steps)

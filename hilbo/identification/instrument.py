@@ -65,13 +65,16 @@ def without_noise(values: Float[np.ndarray, "R m"], clear: Bool[np.ndarray, " m"
     """Input with the rows outside `clear` replaced by the local line through such rows around them.
 
     Noise of the input would bias the fitted stiffness towards 0, and shifting that noise would bias the lag. `values`
-    (R, m) of rows at even times, `clear` (m,): rows with a significant change -> (R, m).
+    (R, m) at even times, `clear` (m,): rows with a significant change, which stay as they are -> (R, m).
     """
     return np.where(clear, values, local_line(values, ~clear))
 
 
 def is_position_clearer(test: Test) -> bool:
-    """Whether the position has the higher ratio of largest change to noise than the force."""
+    """Whether the position has a higher ratio of its largest change to its noise than the force.
+
+    The test must have a recorded input.
+    """
     assert test.input is not None
     position, force = (test.input, test.output) if test.kind == "relaxation" else (test.output, test.input)
     return _clearness(position) > _clearness(force)
@@ -83,14 +86,14 @@ def is_fitted_in_force(test: Test) -> bool:
 
 
 def _clearness(values: Float[np.ndarray, "R m"]) -> float:
-    """Ratio of the largest row-to-row change to the noise of such a change; inf without noise."""
+    """Ratio of the largest row-to-row change of the mean repeat to the noise of such a change; inf without noise."""
     mean = values.mean(axis=0)
     noise = _noise_of_change(mean)
     return float(np.max(np.abs(np.diff(mean, prepend=0.0))) / noise) if noise > 0 else np.inf
 
 
 def _noise_of_change(mean: Float[np.ndarray, " m"]) -> float:
-    """Standard deviation of the noise in a row-to-row change, from fourth differences."""
+    """Standard deviation of the noise in a row-to-row change of `mean` (m,), from fourth differences."""
     # A fourth difference, which a smooth curve does not have, has the variance of 70 samples, a first one that of two.
     return float(1.4826 * np.median(np.abs(np.diff(mean, 4))) / np.sqrt(35))
 

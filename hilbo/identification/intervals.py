@@ -86,7 +86,7 @@ class Intervals(eqx.Module):
 def spread(fit: Fit, quantile: float = 1.959964) -> Spread:
     """Sandwich covariance and profile cuts; coordinates at a bound stay fixed, except the one being profiled.
 
-    `quantile`: standard normal quantile of the confidence level.
+    `quantile`: standard normal quantile of the confidence level; the default is 95 %. Compiled.
     """
     q = fit.q
     slopes = jax.jacfwd(lambda x: fitted_residuals(fit, x))(q)
@@ -115,7 +115,11 @@ def spread(fit: Fit, quantile: float = 1.959964) -> Spread:
 def _between_repeats(
     fit: Fit, slopes: tuple[Float[Array, "_ p"], ...], variance: Float[Array, " p"], freedom: Float[Array, ""]
 ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-    """Inflation of the standard errors by scatter between repeats (at least 1), and degrees of freedom. (p,) each."""
+    """Inflation of the standard errors by scatter between repeats (at least 1), and degrees of freedom. (p,) each.
+
+    `slopes`: Jacobian (m, p) of each curve's residuals; `variance` (p,) without the scatter; `freedom` without it. No
+    inflation if a test has fewer than 5 repeats.
+    """
     if min(w.size for w in fit.weights) < FEWEST_REPEATS:
         return jnp.ones_like(variance), jnp.broadcast_to(freedom, variance.shape)
     ratio = sum(_variance_of_mean(u, 0) for u in _influences(fit, slopes)) / variance
@@ -124,7 +128,7 @@ def _between_repeats(
 
 
 def profile_intervals(fitted: Fit, quantile: float = 1.959964) -> Intervals:
-    """Profile-likelihood intervals at the level of a normal `quantile` (default 95 %), in one compiled search."""
+    """Profile-likelihood interval of each coordinate at the level of a normal `quantile` (default 95 %)."""
     return _profile(fitted, spread(fitted, quantile))
 
 
@@ -146,7 +150,7 @@ class _Search(NamedTuple):
 
 @program
 def _profile(fit: Fit, sampling: Spread) -> Intervals:
-    """Search both ends of the interval of every coordinate."""
+    """Search both ends of the interval of every coordinate, one after the other; compiled."""
     size = fit.q.size
     which, side = jnp.repeat(jnp.arange(size), 2), jnp.tile(jnp.array([-1.0, 1.0], fit.q.dtype), size)
     # One after the other: together, all would wait for the slowest.
@@ -159,7 +163,11 @@ def _profile(fit: Fit, sampling: Spread) -> Intervals:
 
 
 def _end(fit: Fit, sampling: Spread, j: Int[Array, ""], sign: Float[Array, ""]) -> _Search:
-    """Search the distance from the estimate of coordinate j at which the profile reaches the cut, on side `sign`."""
+    """Search the end of the profile interval of coordinate `j` on one side, `sign` -1 or 1; returns the final state.
+
+    Its `distance` is that of the end from the estimate; `open` if it depends on a bound; not `done` if the search
+    failed.
+    """
     q, cut, row = fit.q, sampling.cut[j], sampling.inverse[j]
     room = jnp.where(sign > 0, fit.upper[j] - q[j], q[j] - fit.lower[j])
     is_j = jnp.arange(q.size) == j
@@ -196,7 +204,11 @@ def _narrowed(
     q: Float[Array, " p"],
     at_bound: Bool[Array, ""],
 ) -> _Search:
-    """Next search state after an evaluation at `distance` from the estimate q; `root` = √(rise of the cost / cut)."""
+    """Next search state after an evaluation at `distance` from the estimate `q`.
+
+    `root` = √(rise of the cost / cut), 1 at the end sought; `solution`: the fit of the other coordinates; `at_bound`:
+    `distance` is that of the coordinate's bound.
+    """
     outside = root > 1
     inner, inner_root = _pick(outside, (state.inside, state.inside_root), (distance, root))
     outer, outer_root = _pick(outside, (distance, root), (state.outside, state.outside_root))
@@ -217,7 +229,7 @@ def _narrowed(
 
 
 def _pick(condition: Bool[Array, ""], yes: tuple[Array, ...], no: tuple[Array, ...]) -> Iterator[Array]:
-    """Select each element of `yes` if the condition is true, else of `no`."""
+    """Iterate over the elements of `yes` if the condition is true, else of `no`."""
     return (jnp.where(condition, a, b) for a, b in zip(yes, no, strict=True))
 
 
@@ -235,8 +247,9 @@ def block_bootstrap(
 ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
     """Studentised bootstrap interval of each coordinate; whole repeats of every test are resampled.
 
-    To first order, an estimate moves by the mean of its repeats' influences A⁻¹ J_cᵀ r_ck; `exact` refits instead.
-    Returns the lower and upper ends, (p,) each. Raises `InputError` for a test with fewer than 5 repeats.
+    To first order, an estimate moves by the mean of its repeats' influences A⁻¹ J_cᵀ r_ck; `exact` refits every
+    resample instead. `quantile`: standard normal quantile of the confidence level. Returns the lower and upper ends,
+    (p,) each. Raises `InputError` for a test with fewer than 5 repeats.
     """
     fewest = min(w.size for w in fitted.weights)
     if fewest < FEWEST_REPEATS:
@@ -248,7 +261,7 @@ def block_bootstrap(
 def _bootstrap(
     fit: Fit, key: PRNGKeyArray, resamples: int, quantile: float, exact: bool
 ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-    """Compute `block_bootstrap` in one compiled function."""
+    """Compute `block_bootstrap` in one compiled function; the number of repeats is not checked."""
     keys = jax.random.split(key, len(fit.weights))
     draws = tuple(jax.random.randint(k, (resamples, w.size), 0, w.size) for k, w in zip(keys, fit.weights, strict=True))
     influences = _influences(fit, jax.jacfwd(lambda x: fitted_residuals(fit, x))(fit.q))
@@ -272,7 +285,10 @@ def _variance_of_mean(values: Float[Array, "*m p"], axis: int) -> Float[Array, "
 
 
 def _influences(fit: Fit, slopes: tuple[Float[Array, "_ p"], ...]) -> tuple[Float[Array, "_ p"], ...]:
-    """Influence of each repeat on the estimate, to first order; one (R, p) array per curve."""
+    """Influence of each repeat on the estimate, to first order; one (R, p) array per curve.
+
+    `slopes`: Jacobian (m, p) of each curve's residuals.
+    """
     inverse = _inverse(fit.solution.normal, _free(fit))
     pulls = []
     for curve, J in zip(fit.curves, slopes, strict=True):
@@ -288,12 +304,12 @@ def inverse_of_free(fit: Fit) -> Float[Array, "p p"]:
 
 
 def _free(fit: Fit) -> Bool[Array, " p"]:
-    """Whether each coordinate is not at a bound."""
+    """Mask (p,) of the coordinates that are not at a bound."""
     return ~fit.held()
 
 
 def _inverse(normal: Float[Array, "p p"], free: Bool[Array, " p"]) -> Float[Array, "p p"]:
-    """Inverse of the normal matrix over the free coordinates, 0 elsewhere."""
+    """Inverse (p, p) of the normal matrix over the free coordinates, 0 elsewhere."""
     both = free[:, None] & free[None, :]
     scale = jnp.sqrt(jnp.where(free, jnp.diag(normal), 1))
     outer = scale[:, None] * scale[None, :]
@@ -303,9 +319,9 @@ def _inverse(normal: Float[Array, "p p"], free: Bool[Array, " p"]) -> Float[Arra
 
 
 def _student(quantile: float, freedom: Float[Array, "*p"]) -> Float[Array, "*p"]:
-    """Student's t quantile from the normal `quantile`, by Cornish-Fisher expansion.
+    """Student's t quantile at the level of the normal `quantile`, by Cornish-Fisher expansion.
 
-    For 5 or more degrees of freedom.
+    For 5 or more degrees of freedom (`freedom`).
     """
     z, f = quantile, freedom
     return z + (z**3 + z) / (4 * f) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * f**2)

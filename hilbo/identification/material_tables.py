@@ -65,10 +65,11 @@ def read_material(
     only: str | None = None,
     longest: float | None = None,
 ) -> Material:
-    """Read the tests of one material from a table.
+    """Read the tests of one material from a CSV or Parquet file, in s, mm, N, Pa (or N/mm) and 1/Pa (or mm/N).
 
-    `begin`: state before the first row, "rest" or "equilibrium" (`fitting.Test`); `only`: kind of test to read;
-    `longest`: read the rows up to this time (s). Raises `InputError`.
+    `material`: name, needed if the table has several; `begin`: state before the first row, "rest" or "equilibrium"
+    (`fitting.Test`); `only`: kind of test to read; `longest`: read the rows up to this time (s). Raises `InputError`
+    for a file that cannot be read, a column or value that is not valid, and a test that is not there or not usable.
     """
     source = str(path)
     text = read_cells(path, "a material table needs a header with units and the samples of a test")
@@ -116,14 +117,14 @@ class _Head(NamedTuple):
 
     @property
     def usable(self) -> bool:
-        """Whether the unit is a known unit of the quantity."""
+        """Whether the unit is a known unit of the quantity; False without a unit."""
         return self.unit in _UNITS[self.quantity]
 
 
 def _columns(text, source):
-    """Columns and units by quantity: two dicts.
+    """Columns and units by quantity: two dicts. `text`: table of texts; `source`: name of the file, for messages.
 
-    Raises `InputError` for unknown units and missing or duplicate columns.
+    Raises `InputError` for unknown or missing units, and for missing or duplicate columns.
     """
     columns, units = {}, {}
     for head in _quantities(text.columns):
@@ -149,7 +150,7 @@ def _columns(text, source):
 
 
 def _quantities(columns: Iterable[str]) -> list[_Head]:
-    """Headers of the columns that hold quantities.
+    """Headers of the columns that hold quantities, with a valid unit or not.
 
     One-letter names that denote another quantity, such as T (degC) or g, are left out: if another column has the
     quantity's full name and the letter is not its usual symbol, or if its unit is not a unit of the quantity and the
@@ -163,7 +164,7 @@ def _quantities(columns: Iterable[str]) -> list[_Head]:
 
 
 def _head(column: str) -> _Head | None:
-    """Parse a column name into quantity and unit; None if it names no quantity."""
+    """Parse a column name into quantity and unit, "" without one; None if it names no quantity."""
     match = _HEAD.fullmatch(column)
     quantity = _QUANTITY.get(match[1].lower()) if match else None
     if match is None or quantity is None:
@@ -173,13 +174,16 @@ def _head(column: str) -> _Head | None:
 
 
 def _is_complete(quantities: Collection[str]) -> bool:
-    """Whether the quantities suffice for a material table: time with position and force, or time with moduli."""
+    """Whether the quantities suffice: time, position and force; or time and moduli without position and force."""
     measured, derived = {"position", "force"} & set(quantities), {"modulus", "compliance"} & set(quantities)
     return "time" in quantities and (len(measured) == 2 or bool(derived and not measured))
 
 
 def _kinds(text, columns, source):
-    """Kind of test of each row. Raises `InputError` for a missing or unknown kind."""
+    """Kind of test of each row, as a series: from the column `test`, or "modulus" or "compliance" by the `columns`.
+
+    Raises `InputError` for a missing or unknown kind, and for a modulus and a compliance in one table.
+    """
     if "position" not in columns:
         both = {"modulus", "compliance"} <= set(columns)
         if both:
@@ -199,7 +203,12 @@ def _kinds(text, columns, source):
 
 
 def _test(kind, values, repeats, source, start, longest, notes):
-    """One kind of test as a `Test`, with its repeats interpolated to common times; appends to `notes` if they were."""
+    """One kind of test as a `Test`, with its repeats interpolated to common times; appends to `notes` if they were.
+
+    `values`: its rows in base units; `repeats`: name of the repeat of each row; `source`: name of the file, for
+    messages; `start`: state before the first row; `longest`: last time (s) to use, or None. Recorded times count from
+    the first row. Raises `InputError` for times that do not increase, moduli at or below 0, and an invalid test.
+    """
     output = {"relaxation": "force", "creep": "position"}.get(kind, kind)
     applied = {"relaxation": "position", "creep": "force"}.get(kind)
     tables = [values[repeats == name] for name in repeats.unique()]
@@ -237,7 +246,7 @@ def _test(kind, values, repeats, source, start, longest, notes):
 
 
 def _shortened(times: list, tables: list, longest: float | None, which: str) -> tuple[list, list]:
-    """Rows of each repeat, and their times (s), up to `longest` s.
+    """Times (s) and rows of each repeat up to `longest` s; all of them for None.
 
     Raises `InputError`, naming the test as `which`, if a repeat has none.
     """
@@ -251,7 +260,10 @@ def _shortened(times: list, tables: list, longest: float | None, which: str) -> 
 
 
 def _common(times: list[Float[np.ndarray, " _"]]) -> tuple[Float[np.ndarray, " m"], bool]:
-    """Times shared by all repeats, those of the first, and whether the other repeats must be interpolated."""
+    """Times shared by all repeats, those of the first one, and whether the other repeats must be interpolated.
+
+    Only times that all repeats cover are shared; there may be none.
+    """
     first = times[0]
     if all(t.size == first.size and np.allclose(t, first, rtol=0, atol=1e-9 * first[-1]) for t in times):
         return first, False

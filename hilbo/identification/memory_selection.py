@@ -36,9 +36,10 @@ def select_memory(
     lag: float = 0.0,
     corner: float = np.inf,
 ) -> tuple[Row, ...]:
-    """Fit the tests with each memory length in `choices`.
+    """Fit the tests with each memory length in `choices`: number of taps, None for full memory; rows in that order.
 
-    `lag` (s) and `corner` (Hz) of the force channel stay fixed.
+    `T` (s); `lag` (s) and `corner` (Hz) of the force channel stay fixed. Raises `InputError` for no choices, and as
+    `fit`.
     """
     if not choices:
         raise InputError("There is no number of taps to choose from.")

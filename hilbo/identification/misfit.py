@@ -25,9 +25,9 @@ _TIMES = (0.3, 0.8, 2.0)  # time constants tested, samples
 
 
 def filter_score(fitted: Fit) -> float:
-    """Score statistic (in standard deviations) for a first-order filter of the force.
+    """Score statistic (in standard deviations) for a first-order low-pass filter of the force.
 
-    Largest of three time constants.
+    The largest of three time constants. Positive if a filter would lower the cost; nothing is refitted.
     """
     model = fitted.model
     corners = jnp.asarray([1 / (2 * np.pi * tau * model.T) for tau in _TIMES])
@@ -36,7 +36,7 @@ def filter_score(fitted: Fit) -> float:
 
 @program
 def _filter_scores(fit: Fit, corners: Float[Array, " f"]) -> Float[Array, " f"]:
-    """Score statistic of a low-pass force filter at each corner frequency (Hz); positive if it lowers the cost."""
+    """Score statistic of a force filter at each corner frequency (Hz), (f,); positive if it lowers the cost."""
     before = fitted_residuals(fit, fit.q)
     slopes = jax.jacfwd(lambda x: fitted_residuals(fit, x))(fit.q)
     models = noises(fit)
@@ -58,7 +58,10 @@ def _filter_scores(fit: Fit, corners: Float[Array, " f"]) -> Float[Array, " f"]:
 
 
 def moved_between_rows(fitted: Fit, tests: Sequence[Test]) -> Float[np.ndarray, " p"]:
-    """Change of the coordinates if the input between rows is a monotone (Fritsch-Carlson) cubic, not linear. (p,)."""
+    """Change of the coordinates, to first order, if the input between rows is a monotone cubic, not linear. (p,).
+
+    The cubic is Fritsch and Carlson's.
+    """
     smooth = tuple(fitted.model.prepare(test, smooth=True) for test in tests)
     return np.asarray(_moved(fitted, smooth))
 

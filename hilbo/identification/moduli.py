@@ -53,7 +53,10 @@ class Continuous(eqx.Module):
         return Continuous(self.weights, jnp.asarray(np.sqrt(times.min() * times.max())))
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of q: moduli up to 50 times the largest, κ from 1e-5 to 1e5, α from 0.01 to 0.99. Two arrays (4,)."""
+        """Lower and upper bounds of q: moduli up to 50 times the largest, κ from 1e-5 to 1e5, α from 0.01 to 0.99.
+
+        Two arrays (4,).
+        """
         (_, top), ends = _extremes(tests), np.log(0.99 / 0.01)
         return np.array([1e-3 * top, 0.0, np.log(1e-5), -ends]), np.array([50 * top, 50 * top, np.log(1e5), ends])
 
@@ -68,7 +71,10 @@ class Continuous(eqx.Module):
         return _prepare(test, self.weights)
 
     def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
-        """G(t) or J(t) at the measured times. `q` (4,) -> (m,), in the unit of the table."""
+        """G(t) or J(t) at the measured times, by the kind of the curve. `q` (4,) -> (m,), in the unit of the table.
+
+        `weights` are not used: the prediction does not depend on the repeats.
+        """
         del weights
         alpha, change = jax.nn.sigmoid(q[3]), q[0] - q[1]
         z = jnp.exp(q[2]) * (curve.time / self.reference) ** alpha
@@ -77,7 +83,7 @@ class Continuous(eqx.Module):
         return 1 / q[0] + change / q[0] ** 2 * z * mittag_leffler_increment(alpha, z * q[1] / q[0])
 
     def natural(self, q: Float[Array, " 4"]) -> Float[Array, " 4"]:
-        """Coordinates converted to the units of their labels. (4,) -> (4,)."""
+        """Coordinates converted to the units of their labels: K_inst, K_eff, κ and α. (4,) -> (4,)."""
         return jnp.stack([q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])])
 
     def parameters(self, q: Float[Array, " 4"]) -> dict[str, Float[Array, ""]]:
@@ -105,7 +111,10 @@ class FractionalMaxwell(eqx.Module):
         return self
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of q: τ far beyond the data on both sides, α from 0.1 to 1, β up to 0.9 α. Two arrays (4,)."""
+        """Lower and upper bounds of q: τ far beyond the data on both sides, α from 0.1 to 1, β up to 0.9 α.
+
+        Two arrays (4,).
+        """
         first, last = min(test.time[0] for test in tests), max(test.time[-1] for test in tests)
         top = np.log(_extremes(tests)[1])
         lower = [top - 25, np.log(first) - 10, 0.1, 0.0]
@@ -123,7 +132,10 @@ class FractionalMaxwell(eqx.Module):
         return _prepare(test, self.weights)
 
     def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
-        """G(t) at the measured times. `q` (4,) -> (m,), in the unit of the table."""
+        """G(t) at the measured times. `q` (4,) -> (m,), in the unit of the table.
+
+        `weights` are not used: the prediction does not depend on the repeats.
+        """
         del weights
         beta = q[2] * q[3]
         log_time = jnp.log(curve.time) - q[1]
@@ -131,7 +143,7 @@ class FractionalMaxwell(eqx.Module):
         return jnp.exp(q[0] - beta * log_time) * shape
 
     def natural(self, q: Float[Array, " 4"]) -> Float[Array, " 4"]:
-        """Coordinates converted to the units of their labels. (4,) -> (4,)."""
+        """Coordinates converted to the units of their labels: G_c, τ (s), α and β/α. (4,) -> (4,)."""
         return jnp.stack([jnp.exp(q[0]), jnp.exp(q[1]), q[2], q[3]])
 
     def parameters(self, q: Float[Array, " 4"]) -> dict[str, Float[Array, ""]]:
@@ -149,7 +161,7 @@ def _prepare(test: Test, weights: Weights) -> Curve:
 
 
 def _extremes(tests: Sequence[Test]) -> tuple[float, float]:
-    """Smallest and largest modulus of the data."""
+    """Smallest and largest modulus of the data, over the means of the repeats; of a compliance its reciprocal."""
     means = [test.output.mean(axis=0) for test in tests]
     moduli = [mean if test.kind == "modulus" else 1 / mean for test, mean in zip(tests, means, strict=True)]
     return float(min(values.min() for values in moduli)), float(max(values.max() for values in moduli))

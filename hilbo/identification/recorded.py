@@ -22,9 +22,9 @@ AROUND = 3  # half-width (rows) of the local line
 
 
 def local_line(values: Float[np.ndarray, "R m"], chosen: Bool[np.ndarray, " m"]) -> Float[np.ndarray, "R m"]:
-    """Smooth each row by a line fitted to the `chosen` rows among it and the three rows on either side.
+    """Smooth each repeat: fit a line to the `chosen` rows among each row and the three on either side of it.
 
-    Where fewer than two of these are chosen, the value itself. `values` (R, m) at even times, `chosen` (m,) -> (R, m).
+    Where fewer than two of these are chosen, the value stays. `values` (R, m) at even times, `chosen` (m,) -> (R, m).
     """
     offsets = np.arange(-AROUND, AROUND + 1.0)
     among = chosen.astype(values.dtype)
@@ -39,12 +39,12 @@ def local_line(values: Float[np.ndarray, "R m"], chosen: Bool[np.ndarray, " m"])
 
 
 def _force_and_position(test: Test) -> tuple[Any, Any]:
-    """Force and position of a test, (R, m) each, whichever was applied."""
+    """Force and position of a recorded test, (R, m) each, whichever was applied."""
     return (test.output, test.input) if test.kind == "relaxation" else (test.input, test.output)
 
 
 def position_driven(test: Test) -> Test:
-    """The test with position as its input and force as its output."""
+    """The same recording as a relaxation test, with position as its input and force as its output."""
     force, position = _force_and_position(test)
     return Test("relaxation", test.time, force, position, test.start)
 
@@ -52,7 +52,7 @@ def position_driven(test: Test) -> Test:
 def interpolated(
     grid: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], rows: Float[np.ndarray, "R m"], smooth: bool
 ) -> Float[np.ndarray, "R n"]:
-    """Interpolate `rows`, sampled at `time`, to the times of `grid`: linearly, or by a `smooth` monotone cubic.
+    """Interpolate `rows`, sampled at `time`, to the times of `grid`: linearly, or by a monotone cubic if `smooth`.
 
     Beyond the last row the values stay constant. -> (R, n).
     """
@@ -64,7 +64,7 @@ def interpolated(
 
 
 def unit_of_force(test: Test) -> float:
-    """Factor that converts a scale of the output to one of force: mean stiffness (N/mm) for creep, 1 for relaxation."""
+    """Factor that converts a scale of the output to one of force: for creep the mean stiffness (N/mm), else 1."""
     force, position = _force_and_position(test)
     return float(np.mean(np.abs(force)) / np.mean(np.abs(position))) if test.kind == "creep" else 1.0
 
@@ -76,7 +76,7 @@ def secant(test: Test) -> float:
 
 
 def transform_length(count: int) -> int:
-    """FFT length for `count` samples: at least three times as long, and fast to transform."""
+    """FFT length for `count` samples: even, at least three times as long, and fast to transform."""
     from scipy.fft import next_fast_len
 
     return 2 * next_fast_len((3 * count + 1) // 2)

@@ -56,12 +56,16 @@ class Noise(eqx.Module):
 
 @program
 def noise(fitted: Fit) -> tuple[Noise, ...]:
-    """Noise models of the residuals, one per curve (compiled)."""
+    """Noise models of the residuals of a fit, one per curve (compiled)."""
     return noises(fitted)
 
 
 def noises(fitted: Fit) -> tuple[Noise, ...]:
-    """Noise models of the residuals, one per curve, for use inside another compiled function."""
+    """Noise models of the residuals of a fit, one per curve, for use inside another compiled function.
+
+    A random walk is part of a model only if its `drift`, tested for the curve alone and for all curves, is below
+    `DRIFTS`.
+    """
     single = [
         _noise(fitted, curve, r) for curve, r in zip(fitted.curves, fitted_residuals(fitted, fitted.q), strict=True)
     ]
@@ -72,13 +76,16 @@ def noises(fitted: Fit) -> tuple[Noise, ...]:
 
 
 def _with_drift(model: Noise, drift: Float[Array, ""]) -> Noise:
-    """Noise model with this drift probability; its random walk is kept only if the probability is below `DRIFTS`."""
+    """Copy of the model with this drift probability; its random walk becomes 0 unless that is below `DRIFTS`."""
     walk = jnp.where(drift < DRIFTS, model.walk, 0)
     return eqx.tree_at(lambda n: (n.walk, n.drift), model, (walk, drift))
 
 
 def _noise(fitted: Fit, curve: Curve, r: Float[Array, " m"]) -> Noise:
-    """Noise model of the residuals r: their own autoregression, or that of the input's noise if its BIC is lower."""
+    """Noise model of the residuals `r`: their own autoregression, or that of the input's noise if its BIC is lower.
+
+    The latter only for a `regular` curve. A random walk is included whatever its `drift` is.
+    """
     own = autoregression(r)
     if not curve.fitted.regular:
         return own
@@ -96,7 +103,7 @@ def _noise(fitted: Fit, curve: Curve, r: Float[Array, " m"]) -> Noise:
 
 
 def _bic(model: Noise, m: int) -> Float[Array, ""]:
-    """BIC of the autoregression for m samples."""
+    """Bayesian information criterion of the autoregression for m samples; lower is better."""
     return m * jnp.log(model.innovation * model.rms**2) + model.order.astype(model.rms.dtype) * float(np.log(m))
 
 
@@ -135,7 +142,7 @@ def autoregression(r: Float[Array, " m"]) -> Noise:
 
 
 def _slow(r: Float[Array, " m"], model: Noise) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """`slow`, `walk` and `drift` of residuals scaled to variance 1, given their autoregression."""
+    """`slow`, `walk` and `drift` of residuals `r` scaled to variance 1, given their autoregression `model`."""
     m = r.size
     omega = jnp.pi * jnp.arange(1, min(_SLOW, m // 4) + 1, dtype=r.dtype) / m
     energy = 2 / m * jnp.square(jnp.cos(omega[:, None] * (jnp.arange(m, dtype=r.dtype) + 0.5)[None, :]) @ r)
@@ -165,7 +172,10 @@ def _density(model: Noise, omega: Float[Array, " w"]) -> Float[Array, " w"]:
 
 
 def weighted_normal(slopes: Float[Array, "m p"], model: Noise) -> Float[Array, "p p"]:
-    """Jᵀ Γ J / variance for the autocovariance Γ of the noise model, computed from its spectrum. `slopes` J (m, p)."""
+    """Jᵀ Γ J / variance (p, p) for the autocovariance Γ of the noise model, computed from its spectrum.
+
+    `slopes` J (m, p).
+    """
     m = slopes.shape[0]
     length = 2 * m
     omega = jnp.pi * jnp.arange(m + 1, dtype=slopes.dtype) / m

@@ -42,7 +42,7 @@ class Rounding(eqx.Module):
 def rounding(values: Float[np.ndarray, "R m"], still: Bool[np.ndarray, " m"]) -> Rounding | None:
     """Quantisation of a channel with evenly timed rows; None if there is none or noise hides it.
 
-    `still` (m,): rows without a significant change.
+    `values` (R, m), any unit; `still` (m,): rows without a significant change, from which the noise is estimated.
     """
     step = step_of(values)
     if step is None:
@@ -61,7 +61,8 @@ def rounding(values: Float[np.ndarray, "R m"], still: Bool[np.ndarray, " m"]) ->
 def step_of(values: Float[np.ndarray, "R m"]) -> float | None:
     """Quantisation step of a recorded channel (smallest difference of distinct values); None if it is not quantised.
 
-    A programmed input has few distinct values too, but changes by few sizes from row to row.
+    `values` (R, m), any unit, as is the step. A programmed input has few distinct values too, but changes by few sizes
+    from row to row: it counts as not quantised.
     """
     distinct = np.diff(np.unique(values))
     distinct = distinct[distinct > _SMALLEST * np.ptp(values)]
@@ -75,7 +76,7 @@ def step_of(values: Float[np.ndarray, "R m"]) -> float | None:
 def variance_of_rounding(
     model: Any, q: Float[Array, " p"], curve: Curve, weights: Float[Array, " R"], slopes: Float[Array, "m p"]
 ) -> Float[Array, "p p"]:
-    """Variance of Jᵀ r (p, p) due to the quantisation of both channels of a curve, at coordinates q.
+    """Variance (p, p) of Jᵀ r due to the quantisation of both channels of a curve, at coordinates `q`; 0 without any.
 
     `slopes` J (m, p).
     """
@@ -99,7 +100,10 @@ def variance_of_rounding(
 def _summed_variance(
     errors: Rounding, weights: Float[Array, " R"], response: Any, to_residuals: Float[Array, "m p"]
 ) -> Any:
-    """Sum the variance over repeats and harmonics; `response` maps quantisation errors to the output."""
+    """Variance (p, p) of Jᵀ r due to the quantisation of one channel, summed over repeats and harmonics.
+
+    `response` maps quantisation errors (2, m) of the channel to the output, `to_residuals` that to Jᵀ r.
+    """
 
     order = jnp.arange(1, errors.sizes.size + 1, dtype=errors.sizes.dtype)
 

@@ -91,7 +91,7 @@ class Sampled(eqx.Module):
         return tuple(name == "K_eff" for name in self.labels), upper
 
     def _corners(self) -> tuple[float, float]:
-        """Lowest and highest corner frequency (Hz) that can be fitted."""
+        """Lowest and highest corner frequency (Hz) of a fitted filter; a given one may be higher."""
         slowest, fastest = instrument.SLOWEST_FILTER * self.T, instrument.FASTEST_FILTER * self.T
         return 1 / (2 * np.pi * slowest), 1 / (2 * np.pi * fastest)
 
@@ -110,13 +110,14 @@ class Sampled(eqx.Module):
         return lower, np.array([50 * top, 50 * top, np.log(1e4), ends, *self._of_fitted(lag, -np.log(fast))])
 
     def _of_fitted(self, lag: float, corner: float) -> list[float]:
-        """The given `lag` and `corner` values that are fitted coordinates of this model, in order."""
+        """List of the given values for those of `lag` and `corner`, in that order, that this model fits."""
         return [value for value, own in ((lag, self.lag), (corner, self.corner)) if _is_fitted(own)]
 
     def starts(self, tests: Sequence[Test]) -> Float[np.ndarray, "starts p"]:
-        """Five starting points: the best non-adjacent points of a grid in (κ, α). (5, p).
+        """Up to five starting points: the best non-adjacent points of a grid in (κ, α). (s, p).
 
-        With position as input every test is linear in K_inst and K_eff, which are solved for at each grid point.
+        With position as input every test is linear in K_inst and K_eff, which are solved for at each grid point,
+        without lag and filter.
         """
         curves = tuple(self.prepare(position_driven(test)) for test in tests)
         lower, upper = self.box(tests)
@@ -131,9 +132,10 @@ class Sampled(eqx.Module):
     def prepare(self, test: Test, *, smooth: bool = False) -> Curve:
         """Convert a test to a `Curve`: interpolate the inputs to the model's samples and transform them.
 
-        Between rows the input is linear, or a `smooth` monotone cubic. A creep test with the noise in its force is
-        fitted with input and output exchanged (`Curve.fitted`): noise of the input passes through the model, and would
-        bias the fitted stiffness upwards. Raises `InputError` for a test with too many samples for the memory.
+        Between rows the input is linear, or a monotone cubic if `smooth`; noise of an input with even rows is smoothed
+        where it does not change. A creep test with the noise in its force is fitted with input and output exchanged
+        (`Curve.fitted`): noise of the input passes through the model, and would bias the fitted stiffness upwards.
+        Raises `InputError` for a test with too many samples for the memory.
         """
         assert test.input is not None
         elapsed = test.time - test.time[0]
@@ -176,7 +178,7 @@ class Sampled(eqx.Module):
         )
 
     def _check_length(self, kind: str, seconds: float):
-        """Raise `InputError` for a test of more than 2,000,000 samples of T."""
+        """Raise `InputError` for a test (of `kind`, lasting so many `seconds`) of more than 2,000,000 samples of T."""
         if seconds > _MOST * self.T:
             raise InputError(
                 f"The {kind} test lasts {seconds:g} s, which is {seconds / self.T:,.0f} samples of T = {self.T:g} s,"
@@ -185,9 +187,9 @@ class Sampled(eqx.Module):
             )
 
     def predict(self, q: Float[Array, " p"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
-        """Response to the weighted mean of the inputs, at the measured times.
+        """Response (force, or position for creep) to the weighted mean of the inputs, at the measured times.
 
-        `q` (p,), `weights` (R,) -> (m,), in mm or N.
+        `q` (p,), `weights` (R,) -> (m,), in N or mm.
         """
         assert curve.spectra is not None and curve.share is not None and curve.before is not None
         H = self._transfer(q, curve.length, damping_radius(curve.length, q.dtype))
@@ -229,7 +231,7 @@ class Sampled(eqx.Module):
         return isinstance(self.corner, float) and bool(np.isinf(self.corner))
 
     def _instrument_multiplier(self, q: Float[Array, " p"], curve: Curve) -> Complex[Array, " {curve.length//2+1}"]:
-        """Multiplier of the input's changes for lag and filter (`instrument`), at the upper half of the circle."""
+        """Multiplier of the input's changes for lag and filter (`instrument`), at points of the upper half circle."""
         lag = q[4] if _is_fitted(self.lag) else jnp.asarray(self.lag, q.dtype) / self.T
         corner = jnp.exp(q[-1]) if _is_fitted(self.corner) else jnp.asarray(2 * np.pi * self.T * self.corner, q.dtype)
         angle = 2 * jnp.pi * jnp.arange(curve.length // 2 + 1, dtype=q.dtype) / curve.length
@@ -254,7 +256,10 @@ class Sampled(eqx.Module):
         return jnp.stack([q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3]), *fitted])
 
     def at(self, tests: Sequence[Test]) -> "Sampled":
-        """Model with numbers as arrays and room for at least 1024 taps, so that all values share one compilation."""
+        """Model with numbers as arrays and room for at least 1024 taps, so that all values share one compilation.
+
+        The tests have no influence. With full memory only given lags and corners become arrays.
+        """
         del tests
         lag, corner = self.lag, self.corner
         if self._has_instrument():
@@ -267,7 +272,10 @@ class Sampled(eqx.Module):
     def coordinates(
         self, K0: float, K1: float, B1: float, alpha: float, lag: float = 0.0, corner: float = np.inf
     ) -> Float[np.ndarray, " p"]:
-        """Coordinates q (p,) of a parameter set; K0 and K1 in N/mm, B1 in N·s^α/mm, lag in s, corner in Hz."""
+        """Coordinates q (p,) of a parameter set; K0 and K1 in N/mm, B1 in N·s^α/mm, lag in s, corner in Hz.
+
+        `lag` and `corner` are used only if the model fits them.
+        """
         kappa = K1 * self.T**alpha / B1
         S = float(self._taps(jnp.asarray(alpha))[1])
         ends = K0 + K1 / (1 + kappa), K0 + K1 * S / (kappa + S)
@@ -275,7 +283,7 @@ class Sampled(eqx.Module):
         return np.array([*ends, np.log(kappa), np.log(alpha / (1 - alpha)), *rest])
 
     def _transfer(self, q: Float[Array, " p"], length: int, radius: float) -> Complex[Array, " {length//2+1}"]:
-        """H at `length` points on the circle with this radius, upper half."""
+        """H (N/mm) at `length` points on the circle with this radius, of which the upper half, (length // 2 + 1,)."""
         kappa, alpha = jnp.exp(q[2]), jax.nn.sigmoid(q[3])
         taps, S = self._taps(alpha)
         if self.memory == "full":
@@ -291,9 +299,9 @@ class Sampled(eqx.Module):
         return K_eff + size * (C - S) / (kappa + C)
 
     def _taps(self, alpha: Float[Array, ""]) -> tuple[Float[Array, " taps"], Float[Array, ""]]:
-        """Coefficients c_0 … c_N, padded with zeros, and S = C(1).
+        """Coefficients c_0 … c_N, padded with zeros, and S = C(1), without cancellation.
 
-        Computed from positive factors without cancellation.
+        With full memory the coefficients are not used: [1], and S = 0.
         """
         if self.memory == "full":
             return jnp.ones(1, alpha.dtype), jnp.zeros_like(alpha)

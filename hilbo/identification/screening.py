@@ -17,9 +17,10 @@ __all__ = ["screened", "separate"]
 def screened(
     model: Any, curves: tuple[Curve, ...], scales: list[Float[Array, ""]], grid: Float[Array, "K A 2"]
 ) -> tuple[Float[Array, "K A"], Float[Array, "K A 2"]]:
-    """Cost and best-fitting stiffnesses (K_inst, K_eff) at each grid point (log κ, logit α).
+    """Cost and best-fitting stiffnesses (K_inst, K_eff) at each grid point (log κ, logit α); compiled.
 
-    `scales`: divisor of the residuals of each curve, N. -> (K, A) and (K, A, 2).
+    `curves` must have position as input; `scales`: divisor (N) of the residuals of each curve. K_eff is not below 0. ->
+    (K, A) and (K, A, 2).
     """
     weights = [jnp.full(c.output.shape[0], 1 / c.output.shape[0], c.scale.dtype) for c in curves]
     ends = jnp.eye(2, dtype=grid.dtype)
@@ -41,7 +42,10 @@ def screened(
 
 
 def separate(costs: Float[np.ndarray, "K A"], count: int) -> list[tuple]:
-    """Indices of up to `count` lowest costs of which no two are adjacent in the grid."""
+    """Indices (row, column) of the lowest costs, up to `count`, of which no two are adjacent, diagonally included.
+
+    Costs that are not finite are left out.
+    """
     remaining, indices = np.where(np.isfinite(costs), costs, np.inf), []
     while len(indices) < count and np.isfinite(remaining).any():
         i, j = np.unravel_index(np.argmin(remaining), remaining.shape)

@@ -30,7 +30,10 @@ def sentences(
     residuals: dict[str, dict[str, Any]],
     tests: Sequence[Test],
 ) -> tuple[str, ...]:
-    """Warnings about a characterisation, one sentence each; `residuals` by kind of test (`characterise`)."""
+    """Warnings about a characterisation, one sentence each; empty for none.
+
+    `residuals`: description of each test's residuals, by kind of test (as in `Characterisation.noise`).
+    """
     words = [*_search(best_fit, sides, estimates), *_residuals(residuals), *_instrument(estimates)]
     words += _coarse(best_fit, sampling, tests)
     T = getattr(best_fit.model, "T", np.inf)
@@ -38,7 +41,7 @@ def sentences(
 
 
 def _search(best_fit: Fit, sides: Intervals, estimates: dict[str, Estimate]) -> Iterator[str]:
-    """Yield warnings about convergence, bounds and parameters that are not identifiable."""
+    """Yield warnings about convergence, a better fit met, bounds, and parameters that are not identifiable."""
     if not bool(best_fit.solution.converged):
         yield "The fit did not converge: the cost is flat in some direction, so no values are printed."
     elif float(sides.lowest) < float(best_fit.solution.cost) * (1 - 1e-4):
@@ -52,7 +55,7 @@ def _search(best_fit: Fit, sides: Intervals, estimates: dict[str, Estimate]) -> 
 
 
 def _residuals(residuals: dict[str, dict[str, Any]]) -> Iterator[str]:
-    """Yield warnings about residuals that exceed the noise of the repeats, or drift."""
+    """Yield warnings about residuals that exceed the noise of the repeats, or drift; arguments as in `sentences`."""
     for kind, row in residuals.items():
         if row.get("over_repeat_noise", 0.0) > _UNRELATED:
             yield (
@@ -70,7 +73,7 @@ def _residuals(residuals: dict[str, dict[str, Any]]) -> Iterator[str]:
 
 
 def _instrument(estimates: dict[str, Estimate]) -> Iterator[str]:
-    """Yield warnings about a lag or filter found in the force channel."""
+    """Yield warnings about a significant lag or an identified filter in the force channel."""
     lag, corner = estimates.get("lag"), estimates.get("corner")
     if lag is not None and lag.lower is not None and lag.upper is not None:
         least = abs(lag.value) - _CERTAIN * (lag.upper - lag.lower) / 2
@@ -90,7 +93,7 @@ def _instrument(estimates: dict[str, Estimate]) -> Iterator[str]:
 
 
 def _coarse(best_fit: Fit, sampling: Spread, tests: Sequence[Test]) -> Iterator[str]:
-    """Yield a warning if the rows of a test are further apart than T, with the parameters this affects."""
+    """Yield a warning if the rows of a test are further apart than T, with the coordinates that this affects."""
     coarse = coarse_kinds(best_fit.model, tests)
     if not coarse:
         return
@@ -106,7 +109,10 @@ def _coarse(best_fit: Fit, sampling: Spread, tests: Sequence[Test]) -> Iterator[
 
 
 def recording(test: Test, T: float) -> Iterator[str]:
-    """Yield warnings about the recorded input of a test: a large change within a gap, or an untared start."""
+    """Yield warnings about the recording of a test: a large change of the input within a gap, or an untared start.
+
+    `T` (s): sampling time of the model, inf for moduli. Nothing is yielded for a test of moduli.
+    """
     if test.input is None:
         return
     applied, measured, time = test.input.mean(axis=0), test.output.mean(axis=0), test.time - test.time[0]

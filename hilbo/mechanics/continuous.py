@@ -47,18 +47,18 @@ def creep_compliance(t: Reals, K0: Reals, K1: Reals, B1: Reals, alpha: Reals) ->
 
 @partial(jax.jit, static_argnums=0)
 def _elementwise(function: Callable, *args: Reals) -> Float[Array, "..."]:
-    """Apply a function of scalars over broadcast arguments, in their common floating dtype."""
+    """Apply a function of scalars over broadcast arguments, in their common floating dtype; compiled."""
     dtype = jnp.result_type(1.0, *args)
     return jnp.vectorize(function)(*(jnp.asarray(arg, dtype) for arg in args))
 
 
 def _power(t: Scalar, alpha: Scalar) -> Scalar:
-    """t^α with finite derivatives at t = 0."""
+    """t^α, and 0 with zero derivatives at t = 0."""
     return jnp.where(t > 0, jnp.where(t > 0, t, 1) ** alpha, 0)
 
 
 def _relaxation(t: Scalar, K0: Scalar, K1: Scalar, B1: Scalar, alpha: Scalar) -> Scalar:
-    """G(t) of one parameter set, also for infinite K1; NaN for values outside their ranges."""
+    """G(t) (N/mm) of one parameter set, also for infinite K1; NaN for values outside their ranges and for B1 = 0."""
     power = _power(t, alpha)
     rigid = jnp.isinf(K1)
     spring = jnp.where(rigid, 1, K1)
@@ -71,7 +71,7 @@ def _relaxation(t: Scalar, K0: Scalar, K1: Scalar, B1: Scalar, alpha: Scalar) ->
 
 
 def _creep(t: Scalar, K0: Scalar, K1: Scalar, B1: Scalar, alpha: Scalar) -> Scalar:
-    """J(t) of one parameter set, by the second form of the module docstring; NaN for values outside their ranges."""
+    """J(t) (mm/N) of one parameter set; NaN for values outside their ranges and for B1 = 0."""
     power = _power(t, alpha)
     ratio = share(K1, K0)  # K1/(K0 + K1)
     later = ratio**2 / B1 * power * mittag_leffler_increment(alpha, K0 * ratio / B1 * power)

@@ -25,19 +25,19 @@ _ROUNDING = 16  # units in the last place of Σ |p_j|
 
 
 def cells_for(degree: int) -> int:
-    """Number of cells from 0 to π on which a polynomial of this degree is bounded."""
+    """Number of cells from 0 to π, a power of 2, on which a polynomial of this degree is bounded."""
     return 2 ** math.ceil(math.log2(_CELLS_PER_TAP * degree + _LEAST_CELLS))
 
 
 def rounding_unit(p: Coefficients) -> float:
-    """Rounding error of a value, relative to Σ |p_j|."""
+    """Bound of the rounding error of a value of p, as a fraction of Σ |p_j|; depends only on the dtype of `p`."""
     return _ROUNDING * namespace_of(p).finfo(p.dtype).eps
 
 
 def least(p: Coefficients, cells: int, best: Any, peak: Number) -> Number:
-    """Lower bound of p before rounding errors; sharp if the minimum is near the angle `peak`.
+    """Lower bound of p over all angles, before rounding errors; sharp if the minimum is near the angle `peak`.
 
-    `peak` is at most one cell away from grid node `best`.
+    `cells` from 0 to π are bounded one by one; `peak` is at most one cell away from grid node `best`.
     """
     xp = namespace_of(p)
     width = math.pi / cells
@@ -54,10 +54,10 @@ def least(p: Coefficients, cells: int, best: Any, peak: Number) -> Number:
 def climb(
     expand: Callable[[Number], tuple[Number, Number, Number]], degree: int, start: Number, width: float
 ) -> Number:
-    """Angle of the maximum within `width` (one cell) of `start`, by Newton's method with steps kept in that interval.
+    """Angle of the maximum within `width` (one cell) of `start` and in [0, π], by eight steps of Newton's method.
 
-    `expand`: angle -> value, slope and second derivative, the latter two per 1/degree of a polynomial that is minimal
-    where the value is maximal. Returns `start` if no larger value is found.
+    `expand`: angle -> value, and slope and second derivative, per 1/`degree`, of a polynomial that is minimal where the
+    value is maximal. Returns `start` if no larger value is found.
     """
     xp = namespace_of(start)
     low, high = xp.maximum(start - width, 0), xp.minimum(start + width, xp.pi)
@@ -85,7 +85,7 @@ def rows(p: Coefficients, count: int) -> Float[Any, "{count} n"]:
 
 
 def on_grid(rows: Float[Any, "m n"], cells: int) -> Float[Any, "m {cells+1}"]:
-    """Taylor terms at the angles πi/cells, i = 0 … cells, as (m, i), by FFT."""
+    """Taylor terms (m, i) at the angles πi/cells, i = 0 … cells, by FFT; `rows` as from `rows()`."""
     xp = namespace_of(rows)
     turn = xp.asarray([1j**m for m in range(len(rows))], np.result_type(rows.dtype, np.complex64))
     half = xp.concatenate([2 * rows[:, :1], rows[:, 1:]], axis=1).astype(turn.dtype) * turn[:, None]
@@ -93,7 +93,7 @@ def on_grid(rows: Float[Any, "m n"], cells: int) -> Float[Any, "m {cells+1}"]:
 
 
 def at_angles(rows: Float[Any, "m n"], angles: Float[Any, " i"]) -> Float[Any, "m i"]:
-    """Taylor terms at arbitrary angles, as (m, i)."""
+    """Taylor terms (m, i) at any `angles` (i,); `rows` as from `rows()`."""
     xp = namespace_of(rows, angles)
     turned = xp.arange(rows.shape[1], dtype=angles.dtype)[:, None] * angles[None, :]
     cos, sin = rows @ xp.cos(turned), rows @ xp.sin(turned)
@@ -101,7 +101,10 @@ def at_angles(rows: Float[Any, "m n"], angles: Float[Any, " i"]) -> Float[Any, "
 
 
 def lowest(taylor: Float[Any, "m i"], radius: Floats, rows: Float[Any, "m n"]) -> Float[Any, " i"]:
-    """Lower bound of p within `radius` of each angle; the last of the `rows` bounds the remainder."""
+    """Lower bound (i,) of p within `radius` of each angle, from its Taylor terms (m, i) there.
+
+    The last of the `rows` (as from `rows()`) bounds the remainder.
+    """
     xp = namespace_of(taylor, rows)
     order, scaled = len(rows) - 1, radius * (rows.shape[1] - 1)
     term = [taylor[m] * scaled**m for m in range(order)]

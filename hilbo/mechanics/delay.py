@@ -43,9 +43,9 @@ _CLEAR = 1.05  # of the largest Y of a spring
 
 
 def check_delay(delay: Any, T: Any) -> bool:
-    """Whether the force is delayed: `delay` (s) is traced, or above 0 anywhere.
+    """Whether the force is delayed: `delay` (s) is above 0 anywhere, or traced by JAX.
 
-    Raises `InputError` for a known delay outside 0 to T.
+    Raises `InputError` for a known delay outside 0 to T (s).
     """
     if not concrete(delay):
         return True
@@ -70,8 +70,8 @@ def least_damping(K_eff: Any, T: Any, delay: Any) -> Any:
 
 
 def clear_of_spring(K_eff: Any, lag: Any) -> Any:
-    """Largest Y of the spring K_eff alone, times the margin 1.05 beyond which Y is increasing in K1. N/mm.
+    """1.05 times the largest Y (N/mm) of the spring K_eff alone; beyond that, the largest Y only rises with K1.
 
-    `lag` is σ.
+    `lag` is σ = delay/T.
     """
     return _CLEAR * K_eff * (1 + 2 * lag + (1 + 8 * lag) ** 0.5) / 2

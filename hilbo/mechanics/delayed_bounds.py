@@ -93,7 +93,10 @@ def _lag(delay: Scalar, T: Scalar) -> Scalar:
 def largest_need(
     span: Span, K1: Scalar, beta: Scalar, alpha: Scalar, K_eff: Scalar, lag: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Maximum of Y (N/mm) over all frequencies, and its angle; `lag` is σ."""
+    """Maximum of Y (N/mm) over all frequencies, and its angle in [0, π]; `lag` is σ.
+
+    `beta` in N/mm. First derivatives are exact, second ones are those at the fixed angle.
+    """
     order = _order(span, alpha)
     rendering = _material(K1, beta, order, K_eff)
     fixed, fixed_lag, (fixed_alpha, fixed_sums) = jax.lax.stop_gradient((rendering, lag, (alpha, order.sums)))
@@ -129,9 +132,10 @@ def delayed_largest_K1(
 
 
 def _solved(span, active, beta, alpha, Y, K_eff, lag):
-    """Solve for the largest K1 by exchange: K1, the binding angle, and whether every K1 is passive.
+    """Solve for the largest K1 by exchange, from above.
 
-    NaN if the rounds are exhausted; `active` False skips the search.
+    Returns K1 (N/mm; NaN if the rounds are exhausted), the binding angle, and whether every K1 is passive. If `active`
+    is False nothing is searched, and every K1 counts as passive. `Y`: the damping of the device in N/mm.
     """
     order = _order(span, alpha)
     grid, S = _grid(order), order.sums.at_dc
@@ -166,12 +170,12 @@ def _solved(span, active, beta, alpha, Y, K_eff, lag):
 
 
 def _order(span: Span, alpha: Scalar) -> _Order:
-    """Order α with the sums of its coefficients."""
+    """Order α with its memory and the sums of its coefficients."""
     return _Order(alpha, sums(alpha, span), span)
 
 
 def _material(K1, beta, order: _Order, K_eff) -> _Material:
-    """Parameters of a rendering; K1 = 0 or β = 0 is a spring alone."""
+    """Parameters of a rendering; K1 = 0 or β = 0 is the spring K_eff alone."""
     S = order.sums.at_dc
     # A spring alone: β = 0, whatever K1 is.
     beta = jnp.where(K1 > 0, beta, 0)
@@ -192,12 +196,12 @@ def _need(m: _Material, nodes: _Nodes, lag: Scalar) -> Float[Array, " n"]:
 
 
 def _angle_of(span: Span, t: Float[Array, "*a"]) -> Float[Array, "*a"]:
-    """Angle of the grid parameter t in [0, 1]: uniform for taps, denser near 0 for exponentials."""
+    """Angle in [0, π] of the grid parameter t in [0, 1]: uniform for short memory, denser near 0 for full memory."""
     return math.pi * (t if span.memory == "short" else t**3)
 
 
 def _count(span: Span) -> int:
-    """Number of grid intervals."""
+    """Number of grid intervals from 0 to π."""
     if span.memory == "full":
         return _NODES_OF_FULL_MEMORY
     return max(_LEAST_NODES, 2 ** math.ceil(math.log2(_NODES_PER_TAP * (span.N + 1))))
@@ -225,7 +229,7 @@ def _nodes(order: _Order, angle: Float[Array, " n"], C: Complex[Array, " n"]) ->
 
 
 def _peak(order: _Order, grid: _Nodes, m: _Material, lag: Scalar) -> Scalar:
-    """Angle of the maximum of Y: parabolas through neighbouring grid nodes, refined by one through closer points."""
+    """Angle of the maximum of Y: by parabolas through neighbouring nodes of the `grid`, then through closer points."""
     Y, count = _need(m, grid, lag), grid.real.shape[0] - 1
     # Y is even about both ends.
     below, above = jnp.concatenate([Y[1:2], Y[:-1]]), jnp.concatenate([Y[1:], Y[-2:-1]])

@@ -29,7 +29,10 @@ _Polynomials = tuple[Coefficients, Coefficients, Coefficients]
 
 
 def short_enclosure(model: FOSLS, lag: Number) -> tuple[Number, Number, Number]:
-    """Lower and upper bound of max Y (N/mm) over all angles, and the angle of the maximum found; `lag` is σ."""
+    """Lower and upper bound of max Y (N/mm) over all angles, and the angle of the maximum found; `lag` is σ.
+
+    For short memory. The upper bound is inf if the lower bound of P is too poor to prove one.
+    """
     polynomials, least_A = _polynomials(model, lag)
     A, U, W = polynomials
     xp = namespace_of(A)
@@ -54,14 +57,17 @@ def short_enclosure(model: FOSLS, lag: Number) -> tuple[Number, Number, Number]:
 
 
 def full_estimate(model: FOSLS, lag: Number) -> tuple[Scalar, Scalar, Scalar]:
-    """Counterpart of `short_enclosure` for full memory: maximum found -/+ the error of the search, not proved."""
+    """Maximum of Y (N/mm) found, minus and plus the error of the search, and its angle; for full memory, not proved.
+
+    `lag` is σ. Results as of `short_enclosure`.
+    """
     largest, angle = largest_need(model.span, model.K1, model.beta, model.alpha, model.dc_gain(), lag)
     error = ESTIMATED * jnp.abs(largest)
     return largest - error, largest + error, angle
 
 
 def _polynomials(model: FOSLS, lag: Number) -> tuple[_Polynomials, Number]:
-    """Cosine coefficients of A, ψA and σ(1 - σ)·|H|²A, all of degree N + 1, and the minimum of A."""
+    """Cosine coefficients (N + 2,) of A, ψA and σ(1 - σ)·|H|²A, as a tuple, and the minimum of A."""
     parts = parts_of(model)
     xp = namespace_of(parts.A)
     zero = xp.zeros(1, parts.A.dtype)
@@ -74,7 +80,10 @@ def _polynomials(model: FOSLS, lag: Number) -> tuple[_Polynomials, Number]:
 
 
 def _expand(polynomials: _Polynomials, angle: Number) -> tuple[Number, Number, Number]:
-    """Y at an angle, with slope and second derivative of P for this Y, per 1/(N + 1)."""
+    """Y at an angle, and slope and second derivative of P for this Y, per 1/(N + 1); for `climb`.
+
+    `polynomials`: as from `_polynomials`.
+    """
     a, u, w = (at_angles(rows(p, 3), angle[None])[:, 0] for p in polynomials)
     Y = larger_root(u[0] / a[0], w[0] / a[0])
     return Y, Y**2 * a[1] - Y * u[1] - w[1], 2 * (Y**2 * a[2] - Y * u[2] - w[2])

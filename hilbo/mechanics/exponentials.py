@@ -26,9 +26,9 @@ __all__ = ["TABLE", "decode", "exponentials"]
 def exponentials(
     alpha: Float[Array, ""], states: int = 10
 ) -> tuple[Float[Array, " {states}"], Float[Array, " {states}"]]:
-    """Weights p_k and losses 1 - λ_k of order α in [0, 1], fastest first; differentiable.
+    """Weights p_k and losses 1 - λ_k of order α in [0, 1], fastest first; differentiable in α.
 
-    `states`: number of exponentials, one of `span.STATES`.
+    `states`: number of exponentials, one of `span.STATES` (`KeyError` for others). -> (states,) each.
     """
     table = jnp.asarray(TABLE[states], alpha.dtype)
     x = 2 * alpha - 1
@@ -42,9 +42,9 @@ def exponentials(
 def decode(
     rates: Float[Array, " m"], logits: Float[Array, " m"], alpha: Float[Array, ""]
 ) -> tuple[Float[Array, " m+1"], Float[Array, " m+1"]]:
-    """Weights p_k and losses 1 - λ_k, fastest first, from the polynomials' values.
+    """Weights p_k and losses 1 - λ_k, fastest first, (m + 1,) each, from the values of the polynomials.
 
-    `rates`: log r_k of all exponentials but the first; `logits`: log weights of the same.
+    `rates`: log r_k of all exponentials but the first, the slowest not yet times α; `logits`: log weights of the same.
     """
     complement = 1 - alpha
     ends = jnp.stack([alpha, *[alpha * complement] * (logits.shape[0] - 1), complement])

@@ -43,15 +43,14 @@ _LONGEST_RELAXATION = 1_000_000  # samples
 
 
 class FOSLS(eqx.Module):
-    """One parameter set of the FO-SLS with its memory (short: `N` taps.
+    """One parameter set of the FO-SLS with its memory and sampling time `T` (s).
 
-    Full: `states` exponentials) and sampling time T.
-
-    K0, K1 (N/mm), B1 (N·s^α/mm) and alpha are scalars of one floating dtype; use `jax.vmap` over records or over
-    constructors for several. For NumPy inputs, `dc_gain`, `beta` and the passivity certificate of short memory are
-    computed by NumPy, without compilation. K1 may be `inf`: K0 parallel to a spring-pot. Raises InputError for K1 < 0,
-    B1 < 0, α outside (0, 1], numbers that are not finite, and for K0 < 0 with full memory. Inside `jit`, where values
-    are unknown, invalid values set alpha to NaN, and so all results.
+    Short memory has `N` taps, full memory `states` exponentials. K0, K1 (N/mm), B1 (N·s^α/mm) and alpha are scalars of
+    one floating dtype; use `jax.vmap` over records or over constructors for several. For NumPy inputs, `dc_gain`,
+    `beta` and the passivity certificate of short memory are computed by NumPy, without compilation. K1 may be `inf`: K0
+    parallel to a spring-pot. Raises InputError for K1 < 0, B1 < 0, α outside (0, 1], numbers that are not finite, for
+    K0 < 0 with full memory, and for T that is not above 0; ValueError for an unknown memory or number of taps or
+    exponentials. Inside `jit`, where values are unknown, invalid values set alpha to NaN, and so all results.
     """
 
     K0: Number
@@ -98,7 +97,7 @@ class FOSLS(eqx.Module):
 
     @property
     def span(self) -> Span:
-        """Memory of the model."""
+        """Memory of the model, with the number of taps or exponentials."""
         return span(self.memory, self.N, self.states)
 
     @property
@@ -107,7 +106,7 @@ class FOSLS(eqx.Module):
         return pot_stiffness(self.B1, self.alpha, self.T)
 
     def frequency_response(self, omega: Real[ArrayLike, "*w"]) -> Complex[Array, "*w"]:
-        """H(e^{jωT}) (N/mm) at angular frequencies ω (rad/s) up to π/T.
+        """H(e^{jωT}) (N/mm) of the sampled model at angular frequencies ω (rad/s) up to π/T.
 
         `omega` of any shape -> complex, the same shape.
         """
@@ -144,10 +143,10 @@ class FOSLS(eqx.Module):
     ) -> Float[Array, " n"]:
         """Force (N) that follows positions `x` (mm), one every T; differentiable in `x` and in every parameter.
 
-        `start`: from rest at x = 0, or from the equilibrium at x[0], held for ever before. `unilateral`: contact can
-        only push: x below 0 counts as 0 in the history, and forces below 0 as 0. `block` = 1 is the plain recursion,
-        sample by sample; larger blocks give the same numbers up to rounding, faster.
-        `x` (n,) -> (n,).
+        `start`: "rest" at x = 0, or "equilibrium" at x[0], held for ever before. `unilateral`: contact can only push: x
+        below 0 counts as 0 in the history, and forces below 0 as 0. `block` = 1 is the plain recursion, sample by
+        sample; larger blocks give the same numbers up to rounding, faster. `x` (n,) -> (n,). Raises `InputError` for
+        another shape or an unknown `start`.
         """
         return _force(self, self._series("x", x), _checked_start(start), unilateral, block)
 
@@ -162,7 +161,10 @@ class FOSLS(eqx.Module):
         return _position(self, self._series("F", F), _checked_start(start), block)
 
     def _series(self, name: str, value: Real[ArrayLike, " n"]) -> Float[Array, " n"]:
-        """Samples as an array. Raises `InputError` for another shape than (n,)."""
+        """Samples as an array of the model's dtype.
+
+        Raises `InputError`, with the `name` of the argument, for what is not numeric or has another shape than (n,).
+        """
         samples = numbers("FOSLS", name, value, self.K0.dtype)
         if samples.ndim != 1:
             raise InputError(f"FOSLS: {name} has shape {samples.shape}; give one sample every T, of shape (n,).")
@@ -171,11 +173,9 @@ class FOSLS(eqx.Module):
     def settling_time(self, fraction: float) -> Scalar:
         """Time (s) of the first sample at which this `fraction` of the relaxation after a step is complete.
 
-        0.9 for t90.
-
-        With short memory counted sample by sample, `inf` beyond a million samples; with full memory the time t at which
-        E_α(-(K1/B1)·t^α) = 1 - fraction, which may be years. A scalar. Raises `InputError` for a `fraction` that is not
-        at least 0 and below 1.
+        Use 0.9 for t90. With short memory counted sample by sample, `inf` beyond a million samples; with full memory
+        the exact time t, between samples, at which E_α(-(K1/B1)·t^α) = 1 - fraction, which may be years. A scalar; NaN
+        if alpha is. Raises `InputError` for a `fraction` that is not at least 0 and below 1.
         """
         if not 0 <= fraction < 1:
             raise InputError(f"fraction is {fraction}; it must be at least 0 and below 1; write 0.9 for t90.")
@@ -217,7 +217,7 @@ def pot_stiffness(B1: Floats, alpha: Floats, T: float | Floats) -> Floats:
 def slow_stiffness(K1: Number, beta: Number, gl: GLSums) -> Number:
     """H(1) - K0, N/mm: static stiffness of spring and spring-pot in series.
 
-    K1 and `beta` are scalars, in N/mm.
+    K1 and `beta` are scalars, in N/mm; `gl`: sums of the coefficients at the model's order and memory.
     """
     return series(K1, beta * gl.at_dc)
 
@@ -225,21 +225,22 @@ def slow_stiffness(K1: Number, beta: Number, gl: GLSums) -> Number:
 def slow_damping(K1: Number, beta: Number, gl: GLSums, T: float | Number) -> Number:
     """dH/ds at s = 0, N·s/m: T·K1²·β·M1/(K1 + β·S_N)².
 
-    K1 and `beta` are scalars, in N/mm, T in s; the factor 1000 converts N·s/mm to N·s/m.
+    K1 and `beta` are scalars, in N/mm, T in s; `gl`: sums of the coefficients. The factor 1000 converts N·s/mm to
+    N·s/m.
     """
     return 1000 * T * beta * gl.moment * share(K1, beta * gl.at_dc) ** 2
 
 
 @program
 def _frequency_response(model: FOSLS, omega: Float[Array, "*w"]) -> Complex[Array, "*w"]:
-    """H (N/mm) at angular frequencies ω (rad/s)."""
+    """H (N/mm) at angular frequencies ω (rad/s); compiled."""
     pot = response(model.alpha, omega * model.T, model.span)
     return model.K0.astype(pot.dtype) + series(model.K1, model.beta.astype(pot.dtype) * pot)
 
 
 @program
 def _force(model: FOSLS, x: Float[Array, " n"], start: Start, unilateral: bool, block: int) -> Float[Array, " n"]:
-    """Force (N) at each position of x (mm); arguments as in `FOSLS.simulate`."""
+    """Force (N) at each position of x (mm); compiled. Arguments as in `FOSLS.simulate`."""
     beta = model.beta
     gain, stiffness = share(model.K1, beta), series(model.K1, beta)
     x = jnp.maximum(x, 0) if unilateral else x
@@ -253,7 +254,7 @@ def _force(model: FOSLS, x: Float[Array, " n"], start: Start, unilateral: bool, 
 
 @program
 def _position(model: FOSLS, F: Float[Array, " n"], start: Start, block: int) -> Float[Array, " n"]:
-    """Position (mm) at each force of F (N)."""
+    """Position (mm) at each force of F (N); compiled. Arguments as in `FOSLS.simulate_force`."""
     beta = model.beta
     gain, stiffness = share(model.K1, beta), series(model.K1, beta)
     total = model.K0 + stiffness
@@ -266,9 +267,9 @@ def _position(model: FOSLS, F: Float[Array, " n"], start: Start, block: int) -> 
 
 @program
 def _short_settling(model: FOSLS, fraction: Scalar) -> Scalar:
-    """Settling time with short memory: T times the first n with s_n >= fraction·s_inf after a unit step.
+    """Settling time (s) with short memory: T times the first n with s_n >= fraction·s_inf after a unit step.
 
-    s only grows, and the force relaxes with it.
+    s only grows, and the force relaxes with it. inf beyond a million samples; compiled.
     """
     beta, gl = model.beta, sums(model.alpha, model.span)
     gain, feedback = share(model.K1, beta), share(beta, model.K1)
@@ -290,7 +291,7 @@ def _short_settling(model: FOSLS, fraction: Scalar) -> Scalar:
 
 @program
 def _full_settling(model: FOSLS, fraction: Scalar) -> Scalar:
-    """Settling time with full memory: bisection of log z for E_α(-z) = 1 - fraction."""
+    """Settling time (s) with full memory: bisection of log z for E_α(-z) = 1 - fraction; compiled."""
 
     def halve(_, ends):
         low, high = ends
@@ -304,14 +305,17 @@ def _full_settling(model: FOSLS, fraction: Scalar) -> Scalar:
 
 
 def _checked_start(start: Start) -> Start:
-    """Return `start`. Raises `InputError` unless it is "rest" or "equilibrium"."""
+    """Return `start` unchanged. Raises `InputError` unless it is "rest" or "equilibrium"."""
     if start not in get_args(Start):
         raise InputError(f'start is "{start}"; it must be "rest" or "equilibrium".')
     return start
 
 
 def _check_values(K0: float, K1: float, B1: float, alpha: float, memory: Memory) -> None:
-    """Raise `InputError` for parameter values outside their ranges."""
+    """Raise `InputError` for parameter values outside their ranges, or NaN.
+
+    K0 must be 0 or above only with full memory.
+    """
     if not 0 < alpha <= 1:
         raise InputError(f"alpha is {alpha}; it must be above 0 and at most 1: the order of the fractional element.")
     for name, value, most in (("K1", K1, math.inf), ("B1", B1, math.nextafter(math.inf, 0))):

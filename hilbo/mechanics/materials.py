@@ -43,7 +43,7 @@ class Preset(NamedTuple):
     source: str
 
     def model(self) -> FOSLS:
-        """The set as an `FOSLS`."""
+        """The set as an `FOSLS` with short memory."""
         return FOSLS(*self[:4], N=self.N, T=self.T)
 
 
@@ -63,34 +63,37 @@ PRESETS = {
 
 
 def spring(K: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """Spring F = K·x. K in N/mm, a scalar; `memory`: N, T, memory and states of the `FOSLS`, here and below."""
+    """Spring F = K·x. K in N/mm, a scalar; `memory`: N, T, memory and states of the `FOSLS`."""
     return FOSLS(K, 0.0, 0.0, 1.0, **memory)
 
 
 def springpot(B: Real[ArrayLike, ""], alpha: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """Spring-pot F = B·d^α x/dt^α. B in N·s^α/mm, a scalar, as is `alpha`."""
+    """Spring-pot F = B·d^α x/dt^α. B in N·s^α/mm and `alpha` are scalars; `memory` as in `spring`."""
     return FOSLS(0.0, np.inf, B, alpha, **memory)
 
 
 def kelvin_voigt(K: Real[ArrayLike, ""], B: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """Kelvin-Voigt model: spring and dashpot in parallel. K in N/mm, B in N·s/mm, scalars."""
+    """Kelvin-Voigt model: spring and dashpot in parallel. K in N/mm, B in N·s/mm, scalars; `memory` as in `spring`."""
     return FOSLS(K, np.inf, B, 1.0, **memory)
 
 
 def maxwell(K: Real[ArrayLike, ""], B: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """Maxwell model: spring and dashpot in series. K in N/mm, B in N·s/mm, scalars."""
+    """Maxwell model: spring and dashpot in series. K in N/mm, B in N·s/mm, scalars; `memory` as in `spring`."""
     return FOSLS(0.0, K, B, 1.0, **memory)
 
 
 def sls(K0: Real[ArrayLike, ""], K1: Real[ArrayLike, ""], B: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """Standard linear solid: Maxwell model parallel to a spring K0. K0 and K1 in N/mm, B in N·s/mm, scalars."""
+    """Standard linear solid: Maxwell model parallel to a spring K0.
+
+    K0 and K1 in N/mm, B in N·s/mm, scalars; `memory` as in `spring`.
+    """
     return FOSLS(K0, K1, B, 1.0, **memory)
 
 
 def relaxation_load(T: float = 1e-3, *, depth: float = 5.0, hold: float = 3.0) -> Float[np.ndarray, " n"]:
-    """Positions (mm) of the paper's stress relaxation: `depth` from the first sample on, for `hold` seconds.
+    """Positions (mm) of the paper's stress relaxation: constant `depth` from the first sample on, for `hold` seconds.
 
-    -> (hold / T,); T in s, `depth` in mm.
+    -> (hold / T,), rounded; T in s, `depth` in mm.
     """
     return np.full(round(hold / T), depth)
 
@@ -100,6 +103,6 @@ def creep_load(
 ) -> Float[np.ndarray, " n"]:
     """Forces (N) of the paper's creep with recovery: `force` for `hold` seconds, then `rest` for `recovery` seconds.
 
-    -> ((hold + recovery) / T,); T in s.
+    `rest` is a force (N), not a time. -> (hold / T + recovery / T,), each rounded; T in s.
     """
     return np.repeat([force, rest], [round(hold / T), round(recovery / T)])

@@ -67,7 +67,7 @@ def response(alpha: Real[ArrayLike, ""], angle: Real[Array, "*w"], span: Span) -
 def _short_response(
     alpha: Scalar, angle: Float[Array, "*w"], difference: Complex[Array, "*w"], N: int
 ) -> Complex[Array, "*w"]:
-    """C of short memory as (1 - z^{-1})·Σ_{i<N} S_i z^{-i} + S_N z^{-N}; `difference` is 1 - z^{-1}."""
+    """C of short memory as (1 - z^{-1})·Σ_{i<N} S_i z^{-i} + S_N z^{-N}; `angle` θ, `difference` is 1 - z^{-1}."""
     delay = jax.lax.complex(jnp.cos(angle), -jnp.sin(angle))
 
     def add(carry, i):
@@ -81,7 +81,10 @@ def _short_response(
 
 @partial(jax.jit, static_argnames="N")
 def gl_coefficients(alpha: Real[ArrayLike, ""], N: int) -> Float[Array, " {N+1}"]:
-    """Coefficients c_0 … c_N of one order α; `jax.vmap` over `alpha` for several. -> (N + 1,), dimensionless."""
+    """Coefficients c_0 … c_N (c_0 = 1, all others 0 or below) of one order α; `jax.vmap` over `alpha` for several.
+
+    -> (N + 1,), dimensionless.
+    """
     alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha))
     _, tail = jax.lax.scan(partial(_tap, alpha), jnp.ones_like(alpha), _indices(alpha, N))
     return jnp.concatenate([jnp.ones(1, alpha.dtype), -tail])
@@ -89,13 +92,16 @@ def gl_coefficients(alpha: Real[ArrayLike, ""], N: int) -> Float[Array, " {N+1}"
 
 @partial(jax.jit, static_argnames="N")
 def gl_sums(alpha: Real[ArrayLike, ""], N: int) -> GLSums:
-    """Sums of `GLSums` for one order α (a scalar) and a memory of N samples."""
+    """Sums of `GLSums` for one order α (a scalar) and a memory of N samples, by JAX.
+
+    A derivative of any order is one loop over N.
+    """
     return _gl_sums_jet(jnp.asarray(alpha, jnp.result_type(1.0, alpha)), N, 0)[0]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))
 def _gl_sums_jet(alpha: Scalar, N: int, order: int) -> tuple[GLSums, ...]:
-    """The sums and their derivatives by α up to `order`, computed in one loop.
+    """The sums and their derivatives by α up to `order`, (order + 1) records, computed in one loop.
 
     This custom rule makes a Hessian about ten times faster: all directions share the loop over N, and a derivative
     extends the jet by one order instead of adding a loop.
@@ -114,12 +120,12 @@ def _gl_sums_jet_jvp(N, order, primals, tangents):
 
 
 def _first_of_jet(function: Callable) -> Callable:
-    """Jet of order 0: the values alone."""
+    """Jet of order 0: a function of α whose result is a tuple with the value alone."""
     return lambda alpha: (function(alpha),)
 
 
 def _longer(jet: Callable) -> Callable:
-    """Jet with one more derivative."""
+    """Jet with one more derivative: a function of α with the tuple of values and derivatives, one longer."""
 
     def extended(alpha):
         values, slopes = jax.jvp(jet, (alpha,), (jnp.ones_like(alpha),))
@@ -147,7 +153,7 @@ def _gl_sums(alpha: Number, N: int) -> GLSums:
 
 
 def _tap(alpha: Number, partial_sum: Number, i: Number) -> tuple[Number, Number]:
-    """S_i and |c_i| from S_{i-1}."""
+    """S_i and |c_i| from S_{i-1} (`partial_sum`)."""
     return partial_sum * (1 - alpha / i), alpha / i * partial_sum
 
 

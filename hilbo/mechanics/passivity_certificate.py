@@ -73,7 +73,7 @@ class Certificate(eqx.Module):
 
     @property
     def status(self) -> str:
-        """Result for one set: "passive", "violated", or "undecided" if the margin is 0 within rounding."""
+        """Result for one set: "passive" or "violated" if proved, else "undecided": the margin is 0 within rounding."""
         return "passive" if self.passive else "violated" if self.violated else "undecided"
 
 
@@ -95,10 +95,10 @@ class Witness(eqx.Module):
 def needed_damping(
     model: FOSLS, omega: Real[ArrayLike, "*w"], *, delay: Real[ArrayLike, ""] = 0.0
 ) -> Float[Array, "*w"]:
-    """Damping (N·s/m) needed for passivity at each ω in [0, π/T] (rad/s).
+    """Damping (N·s/m) needed for passivity at each ω in [0, π/T] (rad/s); may be negative.
 
-    At ω = 0 the limit, which is H(1)·T/2 - B_eff without `delay`. `delay`: from a sample of the position to its force,
-    s. `omega` of any shape -> the same shape. Raises `InputError` for a delay outside 0 to T.
+    At ω = 0 it is the limit, which is H(1)·T/2 - B_eff without `delay`. `delay`: from a sample of the position to its
+    force, s. `omega` of any shape -> the same shape. Raises `InputError` for a delay outside 0 to T.
     """
     late = check_delay(delay, model.T)
     angle = jnp.asarray(omega, model.K0.dtype) * model.T
@@ -150,13 +150,13 @@ def _certify_late(model: FOSLS, b: Scalar, delay: Scalar) -> Certificate:
 
 
 def _certificate(model: FOSLS, b: Number) -> Certificate:
-    """Certificate without delay."""
+    """Certificate without delay, in NumPy or JAX as the model's numbers."""
     enclose = _full_enclosure if model.memory == "full" else _short_enclosure
     return _with_margin(model, b, *enclose(model))
 
 
 def _late_certificate(model: FOSLS, b: Number, delay: Number) -> Certificate:
-    """Certificate with a delay (s)."""
+    """Certificate with a delay (s), in NumPy or JAX as the model's numbers."""
     enclose = full_estimate if model.memory == "full" else short_enclosure
     return _with_margin(model, b, *enclose(model, delay / model.T))
 
@@ -168,14 +168,17 @@ def _with_margin(model, b, low, high, angle) -> Certificate:
 
 
 def _full_enclosure(model: FOSLS) -> tuple[Scalar, Scalar, Scalar]:
-    """Counterpart of `_short_enclosure` for full memory: the value at the Nyquist frequency -/+ its rounding error."""
+    """Lower and upper bound of max φ (N/mm) for full memory: the value at the Nyquist frequency -/+ its rounding error.
+
+    Third the angle of the maximum, π.
+    """
     stiffness = model.high_frequency_gain()
     error = 4 * jnp.finfo(stiffness.dtype).eps * stiffness
     return stiffness - error, stiffness + error, jnp.asarray(jnp.pi, stiffness.dtype)
 
 
 def _short_enclosure(model: FOSLS) -> tuple[Number, Number, Number]:
-    """Lower and upper bound of max φ (N/mm) over all angles, and the angle of the maximum found."""
+    """Lower and upper bound of max φ (N/mm) over all angles, and the angle of the maximum found; for short memory."""
     A, B, least_A, *_ = parts_of(model)
     xp = namespace_of(A)
     cells = cells_for(model.N)
@@ -192,17 +195,18 @@ def _short_enclosure(model: FOSLS) -> tuple[Number, Number, Number]:
 
 
 def _ratio(A: Coefficients, B: Coefficients, angle: Number) -> tuple[Number, Number, Number]:
-    """B/A at an angle, with slope and second derivative of (B/A)·A - B for this value, per 1/N."""
+    """B/A at an angle, and slope and second derivative of value·A - B for this value, per 1/N; for `climb`."""
     a, b = (at_angles(rows(p, 3), angle[None])[:, 0] for p in (A, B))
     value = b[0] / a[0]
     return value, value * a[1] - b[1], 2 * (value * a[2] - b[2])
 
 
 def witness(model: FOSLS, b: float, *, delay: float = 0.0) -> Witness | None:
-    """Construct a motion that creates energy with a rendering whose damping `certify` proves too low; None for others.
+    """Construct a motion that creates energy with a rendering whose damping `b` (N·s/m) `certify` proves too low.
 
-    x has amplitude 1 mm. For full memory too. A set that violates H(1) >= 0 alone needs no cycle: pulled slowly from x
-    = 0 to x it releases ½·|H(1)|·x².
+    None if the damping is not proved too low, also for a set that only violates H(1) >= 0: that needs no cycle, since
+    pulled slowly from x = 0 to x it releases ½·|H(1)|·x². `delay` in s; x has amplitude 1 mm. For full memory too.
+    Raises `InputError` as `certify`.
     """
     certificate = certify(model, b, delay=delay)
     if not bool(certificate.upper <= 0):
@@ -227,9 +231,9 @@ def witness(model: FOSLS, b: float, *, delay: float = 0.0) -> Witness | None:
 
 
 def _late_witness(model, b, delay, force, x, frequency, needed) -> Witness:
-    """Witness with a delay: the cycle whose bends lose least in the damping that the set needs.
+    """Witness with a delay: the cycle whose bends lose least in the damping `needed` (N·s/m) by the set.
 
-    With less damping the same cycle creates even more energy.
+    With less damping, such as `b`, the same cycle creates even more energy. `force` (n,) N, `x` (n + 1,) mm.
     """
     before = np.roll(force, 1)
     mean, change = np.diff(x) / model.T, (force - before) / (2 * needed / 1000)  # mm/s
@@ -241,7 +245,7 @@ def _late_witness(model, b, delay, force, x, frequency, needed) -> Witness:
 
 
 def _fractional(model: FOSLS, y: Complex[np.ndarray, " n"]) -> Complex[np.ndarray, " n"]:
-    """Σ c_i y_{n-i} of a periodic y, by the taps or the exponentials."""
+    """Σ c_i y_{n-i} of one period y (n,) of a periodic signal, by the taps or the exponentials of the model."""
     if model.memory == "short":
         c = np.asarray(gl_coefficients(model.alpha, model.N))
         return sum((c[i] * np.roll(y, i) for i in range(len(c))), np.zeros_like(y))

@@ -40,7 +40,10 @@ RANGES = {
 
 
 def check_ranges(**values: Reals) -> None:
-    """Raise `InputError` for the first value outside the range of its name; traced values are not checked."""
+    """Raise `InputError` for the first value outside the range of its name (`RANGES`); traced values are not checked.
+
+    NaN is outside every range. Values are numbers or arrays.
+    """
     for name, value in values.items():
         allowed, words = RANGES[name]
         if concrete(value) and not np.all(fine := allowed(np.asarray(value, float))):
@@ -49,5 +52,5 @@ def check_ranges(**values: Reals) -> None:
 
 
 def possible(**values: Any) -> Bool[Array, "..."]:
-    """Whether all values are within the ranges of their names, elementwise; also for traced values."""
+    """Whether all values are within the ranges of their names (`RANGES`), elementwise; also for traced values."""
     return functools.reduce(operator.and_, (RANGES[name][0](value) for name, value in values.items()))

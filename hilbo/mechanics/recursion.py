@@ -45,7 +45,7 @@ class _History(NamedTuple):
 def past_of(
     alpha: Scalar, gain: Scalar, feedback: Scalar, u: Float[Array, " n"], before: Scalar, span: Span, block: int = BLOCK
 ) -> Float[Array, " n"]:
-    """Contribution s_n of the past at every sample, for a history that has been at y = `before` since -∞.
+    """Contribution s_n of the past at every sample, for a history y that has been `before` since -∞. `u` (n,) -> (n,).
 
     `gain` is a, `feedback` is ρ. `block` affects only speed and rounding; 1 is the plain recursion.
     """
@@ -66,7 +66,7 @@ def past_of(
 
 
 def _taps(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
-    """Block form of short memory: the state is the last values of y, the newest last."""
+    """Block form of short memory: the state is the last values of y, the newest last, all `before` at the start."""
     N, length = span.N, max(span.N, block)
     taps = jnp.zeros(length + block, alpha.dtype).at[:N].set(-gl_coefficients(alpha, N)[1:])
     delay = jnp.arange(block)[:, None] + length - jnp.arange(length)[None, :]
@@ -78,7 +78,10 @@ def _taps(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
 
 
 def _means(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
-    """Block form of full memory: the state is one mean for each exponential, |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1}."""
+    """Block form of full memory: the state is one mean for each exponential, |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1}.
+
+    All means are `before` at the start.
+    """
     weight, loss = exponentials(alpha, span.states)
     # As products, which have derivatives at λ = 0.
     powers = jnp.cumprod(jnp.concatenate([jnp.ones_like(loss)[None], jnp.tile(1 - loss, (block - 1, 1))]), axis=0)
@@ -92,7 +95,10 @@ def _means(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
 
 
 def _impulse(taps: Float[Array, " m"], feedback: Scalar) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Impulse response d_0 … d_{m-1}, and (d - 1)/ρ = Σ |c_i| d_{j-i}, the response of s to an input."""
+    """Impulse response d_0 … d_{m-1}, and (d - 1)/ρ = Σ |c_i| d_{j-i}, the response of s to an input; (m,) each.
+
+    `taps`: |c_1| … |c_m|.
+    """
 
     def add(backwards, _):
         echo = taps @ backwards

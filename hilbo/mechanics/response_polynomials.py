@@ -34,7 +34,7 @@ class Parts(NamedTuple):
 
 
 def parts_of(model: FOSLS) -> Parts:
-    """Polynomials A and B of a model, with their components."""
+    """Polynomials A and B of a model with short memory, with their components."""
     beta = model.beta
     xp = namespace_of(model.alpha)
     k = series(model.K1, beta)
@@ -53,7 +53,7 @@ def parts_of(model: FOSLS) -> Parts:
 
 
 def turned_of(parts: Parts, K0: Number) -> Float[Any, " m"]:
-    """Cosine coefficients of Re(e^{-jθ}·H)·A, one degree higher than A."""
+    """Cosine coefficients (N + 2,) of Re(e^{-jθ}·H)·A, one degree higher than A. K0 in N/mm."""
     xp = namespace_of(parts.A)
     zero = xp.zeros(1, parts.A.dtype)
     late = xp.concatenate([zero, parts.C])  # Re(e^{-jθ}·C)
@@ -64,7 +64,7 @@ def turned_of(parts: Parts, K0: Number) -> Float[Any, " m"]:
 
 
 def square_of(parts: Parts, K0: Number) -> Coefficients:
-    """Cosine coefficients of |H|²·A."""
+    """Cosine coefficients (N + 1,) of |H|²·A. K0 in N/mm."""
     xp = namespace_of(parts.A)
     constant, slope = K0 * parts.g, K0 * parts.h + parts.k
     p = slope**2 * parts.square + 2 * constant * slope * parts.C

@@ -21,9 +21,9 @@ class Span(NamedTuple):
 
 
 def span(memory: Memory, N: int, states: int = 10) -> Span:
-    """Check and return the memory of a model; the number that does not apply is set to 0, to avoid recompilation.
+    """Check the memory of a model and return it, with the number that does not apply set to 0, to avoid recompilation.
 
-    Raises ValueError for values out of range.
+    Raises ValueError for an unknown memory, N below 1 (short), and a number of states not in `STATES` (full).
     """
     if memory not in ("short", "full"):
         raise ValueError(f'memory is {memory!r}; it must be "short" (N taps) or "full" (exponentials).')

@@ -26,8 +26,9 @@ def switched_force(
 ) -> Float[Array, " n"]:
     """Force (N) along positions `x` (mm) when `new` is staged at sample `staged` and takes over at sample `flip`.
 
-    The new history starts as if x[staged] had been held for ever. Raises InputError for samples out of order or of
-    range, a `slew` (N/s) that is not above 0, and sets for different sampling times. `x` (n,) -> (n,).
+    At `flip` the difference of the two forces is added to the new one and then reduced by `slew` (N/s). The new history
+    starts as if x[staged] had been held for ever. Raises InputError for samples out of order or of range, a `slew` that
+    is not above 0, and sets for different sampling times. `x` (n,) -> (n,).
     """
     x = jnp.asarray(x, old.K0.dtype)
     if not 0 <= staged <= flip < x.shape[0]:
