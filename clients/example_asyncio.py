@@ -11,7 +11,7 @@ from hilbo_stimulus import Stimulus
 
 
 async def present(stimulus):
-    """Until the task is cancelled."""
+    """Print and confirm orders until the task is cancelled."""
     async for order in stimulus.orders():
         print(order.number, order.do, order.show, dict(order.values), flush=True)
         if order.do == "present":
@@ -21,7 +21,7 @@ async def present(stimulus):
 
 
 async def main(link):
-    """Presents beside whatever else the program does."""
+    """Connect and present orders; other tasks of the loop can run meanwhile."""
     with await asyncio.to_thread(Stimulus, link, "example_asyncio", "1") as stimulus:
         await present(stimulus)
 

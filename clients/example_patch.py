@@ -17,7 +17,7 @@ CLEAR, RESET = "\x1b[2J\x1b[H", "\x1b[0m"
 
 
 def draw(title, values):
-    """A patch under a title; an empty screen without values."""
+    """Clear the terminal and print a patch of colour under a title; only the title if there are no values."""
     lines = [title]
     if values:
         red, green, blue = colorsys.hls_to_rgb(values["hue"] / 360, values["light"] / 100, 0.7)
@@ -27,7 +27,7 @@ def draw(title, values):
 
 
 def main(link):
-    """Presents until Ctrl-C."""
+    """Present orders until Ctrl-C; ends the program for a study with other parameters."""
     with Stimulus(link, name="example_patch", version="1", neutral_within_s=0.2) as stimulus:
         for order in stimulus:
             names = {parameter["name"] for parameter in stimulus.parameters}

@@ -16,7 +16,7 @@ REFERENCE = {"contrast": 30.0, "frequency": 2.0}
 
 
 def main(link):
-    """Draws every frame what the newest order says."""
+    """Draw what the newest order asks for in every frame, until Escape."""
     monitor = monitors.Monitor("session", width=53.0, distance=60.0)  # cm; measure yours
     monitor.setSizePix((1920, 1080))
     window = visual.Window(fullscr=True, monitor=monitor, units="deg", color=0)

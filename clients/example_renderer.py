@@ -29,7 +29,7 @@ REFERENCE = {"K1": 0.4, "B1": 0.4, "alpha": 0.3}
 
 
 class Rendering:
-    """The orders of a session, carried out by a renderer that a thread of its own ticks."""
+    """The orders of a session, carried out by a renderer that is ticked by a thread of its own, started here."""
 
     def __init__(self, renderer, motor):
         self.renderer, self.motor = renderer, motor
@@ -38,7 +38,7 @@ class Rendering:
         self.thread.start()
 
     def loop(self):
-        """A position, a tick, a force, once a millisecond and nothing else."""
+        """Once a millisecond, until `ended` is set: read a position, tick the renderer, command the force."""
         due = time.perf_counter()
         while not self.ended:
             due += 0.001
@@ -51,7 +51,10 @@ class Rendering:
             self.motor.command(self.renderer.tick(position, velocity, time.perf_counter()))
 
     def run(self, stimulus):
-        """Until the program ends."""
+        """Carry out the orders of `stimulus`; ends only by its exceptions.
+
+        If the device stops by itself during a trial, the session is told, which voids the trial.
+        """
         self.stimulus = stimulus
         while True:
             order = stimulus.next(0.01)
@@ -65,14 +68,17 @@ class Rendering:
                 self.rest()
 
     def look(self):
-        """Every few milliseconds, whatever is waited for: the heartbeat, and what the session has to know."""
+        """Send the heartbeat, tell the session about contact, and return the renderer's state.
+
+        To be called every few milliseconds, also while waiting.
+        """
         self.renderer.heartbeat()
         state = self.renderer.state()
         self.stimulus.contact = bool(state.contact)
         return state
 
     def wait(self, seconds, is_so):
-        """Whether it is the case within so many seconds."""
+        """Wait until `is_so(state)` is true, for at most `seconds`; whether it became true."""
         end = time.monotonic() + seconds
         while not is_so(self.look()):
             if time.monotonic() > end:
@@ -81,7 +87,7 @@ class Rendering:
         return True
 
     def present(self, order):
-        """Render what was ordered, or say why not."""
+        """Put an order's set (or the reference) in force and confirm it; if that fails, stop and report the reason."""
         values = order.values if order.show == "test" else REFERENCE
         try:
             self.put_in_force(values, order.within_s - 0.1)
@@ -93,7 +99,11 @@ class Rendering:
             self.stimulus.presented()
 
     def put_in_force(self, values, seconds):
-        """The set is rendered when this returns."""
+        """Stop, load the set, and start; the set is rendered when this returns.
+
+        Raises `DeviceError` if the device is not at rest or the handle stays in the material for `seconds`, and
+        `InputError` if the set is refused.
+        """
         self.presents = False
         if not self.at_rest():
             raise DeviceError(self.renderer.why())
@@ -107,7 +117,7 @@ class Rendering:
         self.renderer.start(state.stops)
 
     def at_rest(self):
-        """STOPPED, and what held is cleared: the trial that it held in is void by now."""
+        """Stop the renderer and clear a HOLD or ESTOP; whether it is STOPPED within 0.2 s."""
 
         def stopped(state):
             if state.state in (State.HOLD, State.ESTOP):
@@ -121,13 +131,13 @@ class Rendering:
         return self.wait(0.2, stopped)
 
     def rest(self):
-        """Nothing pushes."""
+        """Stop the renderer and confirm "neutral"; nothing is confirmed if it does not come to rest."""
         self.presents = False
         if self.at_rest():
             self.stimulus.neutral()
 
     def close(self):
-        """The loop takes the force down, then ends."""
+        """Stop the renderer, let the loop take the force down for 50 ms, then end its thread."""
         self.renderer.stop()
         time.sleep(0.05)
         self.ended = True
@@ -135,7 +145,7 @@ class Rendering:
 
 
 def main(link):
-    """Presents until Ctrl-C."""
+    """Present orders until Ctrl-C, at real-time priority where the system allows it."""
     sys.setswitchinterval(0.0002)  # the loop waits so long for the other threads
     with contextlib.suppress(AttributeError, PermissionError):  # where that is allowed, all go before other programs
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))

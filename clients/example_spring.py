@@ -20,11 +20,11 @@ NEUTRAL, REFERENCE = (0.0, 0.0), (0.8, 0.005)
 
 
 def set_motor(force):
-    """A force in N: here for your motor's call."""
+    """Set a force in N; does nothing here: put your motor's call in its place."""
 
 
 class Spring:
-    """Stiffness and damping, replaced as one; both 0: no force, whatever the position."""
+    """Stiffness (N/mm) and damping (N s/mm) as one tuple `set`; both 0: no force, whatever the position."""
 
     def __init__(self):
         self.set, self.ended = NEUTRAL, False
@@ -34,7 +34,10 @@ class Spring:
         self.set = NEUTRAL
 
     def loop(self, stimulus):
-        """Until the program ends; on stderr when the spring comes and goes."""
+        """Render the spring at 1 kHz until `ended` is set, and tell `stimulus` about contact.
+
+        Prints to stderr when the force comes and goes.
+        """
         touched, pushed, begun = False, False, time.perf_counter()
         while not self.ended:
             phase = 2 * math.pi * (time.perf_counter() - begun) / 0.6  # a finger that comes every 0.6 s
@@ -50,7 +53,7 @@ class Spring:
 
 
 def main(link):
-    """Presents until Ctrl-C."""
+    """Present orders until Ctrl-C, with the loop in a thread of its own."""
     spring = Spring()
     said = {"force": True, "go_neutral": spring.neutral, "neutral_within_s": 0.05}
     with Stimulus(link, name="example_spring", version="1", **said) as stimulus:

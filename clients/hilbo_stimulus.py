@@ -50,16 +50,15 @@ _log = logging.getLogger("hilbo_stimulus")
 
 
 class StimulusError(RuntimeError):
-    """The session does not let this program in, and says why."""
+    """The session does not let this program in, or has ended its part; the message gives the reason."""
 
 
 class Order(NamedTuple):
-    """What shall be the case from now on.
+    """What the program has to show from now on, to be confirmed within `within_s`.
 
     `do`: "present", "neutral" (show nothing, push nothing) or "stop" (the same, at once). `show`: "test", with the
-    `values` of its parameters in the study's units, of levels their names, or "reference"; `side`: "a" or "b" where two
+    `values` of its parameters in the study's units (names for levels), or "reference"; `side`: "a" or "b" where two
     tests are compared.
-    It has to be confirmed within `within_s`.
     """
 
     number: int
@@ -76,12 +75,15 @@ _SILENCE = Order(0, "neutral")  # before a server has spoken, and after one is s
 
 
 class Stimulus:
-    """This program's part in a session. `link`: what `hilbo session` prints for the stimulus, one program at a time.
+    """Connection of this program to a session, kept by two threads of its own until `close`.
 
-    `key_file`: where the key that it was traded for is kept, readable by you alone: a program that is started with it
-    waits, and says so once, until the one before has been silent. `neutral_within_s`: so soon is everything neutral
-    after `go_neutral` was called, or after an order, and the session is told so. Raises `StimulusError` if the session
-    does not let it in.
+    `link`: the one that `hilbo session` prints for the stimulus, for one program at a time. `force`: the program moves
+    something that people touch; it must then give `go_neutral`, a function that takes all force away and is called in a
+    thread of this class. `neutral_within_s`: time (s) within which everything is neutral after `go_neutral` was called
+    or after an order; it is reported to the session. `key_file`: file, readable by you alone, in which the key that the
+    link was traded for is kept: a program that is started again with it may go on, and waits, with one warning, until
+    the one before has been silent. Raises `StimulusError` if the session does not let it in, ValueError for `force`
+    without `go_neutral`, OSError without a connection.
     """
 
     def __init__(
@@ -120,12 +122,15 @@ class Stimulus:
 
     @property
     def order(self) -> Order:
-        """The newest order, for programs that look at every frame."""
+        """The newest order, for programs that look at every frame; "neutral" while no server has given one."""
         return self._order
 
     @property
     def contact(self) -> bool:
-        """Whether somebody touches what moves; no order to present is handed out meanwhile."""
+        """Whether somebody touches what moves, set by your program.
+
+        With `force`, orders to present are withheld by `next` meanwhile.
+        """
         return self._contact
 
     @contact.setter
@@ -135,9 +140,10 @@ class Stimulus:
             self._changed.notify_all()
 
     def next(self, timeout: float | None = None) -> Order | None:
-        """The newest order that was not handed out yet, once there is one; None after `timeout` s, or at the end.
+        """Wait for the newest order that was not returned yet; None after `timeout` s, or once closed.
 
-        Raises `StimulusError` when this program is no longer part of the session.
+        No `timeout`: wait as long as it takes. Raises `StimulusError` when this program is no longer part of the
+        session.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._why or self._is_due(), timeout)
@@ -149,7 +155,7 @@ class Stimulus:
             return self._handed
 
     def __iter__(self) -> Iterator[Order]:
-        """All orders, until `close`; of several at once the newest."""
+        """Yield orders until `close`; if several came at once only the newest. Raises `StimulusError` as `next`."""
         while True:
             order = self.next(0.5)
             if order is not None:
@@ -158,7 +164,7 @@ class Stimulus:
                 return
 
     async def orders(self) -> AsyncIterator[Order]:
-        """The same for asyncio."""
+        """Yield orders as `__iter__` does, for asyncio; each wait takes a thread of the loop's executor."""
         while True:
             order = await asyncio.get_running_loop().run_in_executor(None, self.next, 0.5)
             if order is not None:
@@ -167,8 +173,11 @@ class Stimulus:
                 return
 
     def presented(self, values: Mapping[str, Any] | None = None) -> bool:
-        """What the last order asked for is shown from now on, with these values (by default those asked for). False if
-        that is not taken: too late, too far off; the trial is void then."""
+        """Confirm that what the last order asked for is shown from now on; whether the session accepted that.
+
+        `values`: what is really shown, by default what the order asked for. False if it came too late or is too far off
+        (the trial is void then), or if the connection failed. Raises ValueError for a value that is not finite.
+        """
         order = self._handed
         found = dict(order.values if values is None else values)
         for name, value in found.items():
@@ -177,19 +186,22 @@ class Stimulus:
         return self._say(order, "presented", **({"values": found} if found else {}))
 
     def neutral(self) -> bool:
-        """Nothing is shown, and nothing pushes, from now on."""
+        """Confirm that nothing is shown, and nothing pushes, from now on; whether the session accepted that."""
         return self._say(self._handed, "neutral")
 
     def failed(self, why: str) -> bool:
-        """What the last order asked for cannot be shown; the trial is void."""
+        """Report that the last order cannot be carried out, and why: the trial is void. Whether that was accepted."""
         return self._say(self._handed, "failed", why=why[:500])
 
     def begin_again(self, why: str) -> None:
-        """Report that a device has stopped by itself: the trial is void, and the program registers again."""
+        """Report that a device has stopped by itself, and why: the trial is void.
+
+        `go_neutral` is called, and the program registers with the session again.
+        """
         self._lost(why)
 
     def close(self) -> None:
-        """Go neutral, and leave."""
+        """Call `go_neutral`, end the connections and wait for the threads; nothing is reported to the session."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -204,19 +216,22 @@ class Stimulus:
             line.close()
 
     def __enter__(self) -> Stimulus:
+        """Return this object."""
         return self
 
     def __exit__(self, *_: Any) -> None:
+        """Close, also after an exception."""
         self.close()
 
     # What goes on beside it.
 
     def _is_due(self) -> bool:
+        """Whether there is an order that `next` has not returned yet and that may be returned now (see `contact`)."""
         waits = self._hello["force"] and self.contact and self._order.do == "present"
         return self._order is not self._handed and not waits
 
     def _talk(self) -> None:
-        """Says how things are, again and again, and keeps the newest order."""
+        """Body of the first thread: register, then report the state regularly and receive orders, until the end."""
         while not self._closed and not self._why:
             try:
                 if not self._run:
@@ -230,13 +245,18 @@ class Stimulus:
                 time.sleep(_AGAIN)
 
     def _listen(self) -> None:
-        """Nobody waits longer for a server that says nothing than it stated."""
+        """Body of the second thread: go neutral as soon as the server has been silent for longer than `silence_s`."""
         while not self._closed:
             time.sleep(min(0.05, self.silence_s / 10))
             if self._run and time.monotonic() - self._heard > self.silence_s:
                 self._lost(f"the server has been silent for {self.silence_s:g} s")
 
     def _begin(self) -> None:
+        """Register this program with the session and take its first order.
+
+        If the session refuses for good, end; if another program still has the place, warn once and return after a
+        pause.
+        """
         status, found = self._post("/api/stimulus/hello", self._hello)
         if status == 200:
             self._hello["run"] = found["run"]  # if it is lost, its own place is taken at once
@@ -253,7 +273,11 @@ class Stimulus:
             time.sleep(_AGAIN)
 
     def _say(self, order: Order, state: str, **more: Any) -> bool:
-        """A report from the program's own thread; whether it was taken."""
+        """Send a report from the program's own thread; whether it was accepted.
+
+        False without sending for an order that is no longer the newest; True without sending for one that no server
+        gave. A failed connection makes everything neutral.
+        """
         if order.number != self._order.number:
             return False  # it is over; the next one is there already
         if not order.number:
@@ -268,7 +292,11 @@ class Stimulus:
         return taken
 
     def _report(self, order: Order, state: str, **more: Any) -> bool:
-        """Says how things are; whether that was taken."""
+        """Send one report and take the order in the reply; whether the report was accepted.
+
+        Not sent while the program is not registered. A refusal for good ends this program's part, other conflicts make
+        it register again.
+        """
         run = self._run
         if not run:
             return False
@@ -287,7 +315,7 @@ class Stimulus:
         return status == 200
 
     def _take(self, run: str, found: Mapping[str, Any]) -> None:
-        """A new order of the run that goes on; one that asks for it is neutral at once."""
+        """Store a newer order of the current registration (`run`); call `go_neutral` if it is not to present."""
         with self._changed:
             if run != self._run:
                 return  # it came after the silence
@@ -301,6 +329,7 @@ class Stimulus:
             self._done = (order.number, "neutral")
 
     def _neutral_now(self) -> bool:
+        """Call `go_neutral`, if given; False, with a log entry, if it raised an exception."""
         try:
             if self._go_neutral is not None:
                 self._go_neutral()
@@ -310,7 +339,10 @@ class Stimulus:
             return False
 
     def _lost(self, why: str) -> None:
-        """There is no server to be heard: neutral, and said to your program as an order."""
+        """Give up the registration: the order becomes "neutral", `go_neutral` is called, and `why` is logged.
+
+        Nothing happens if the program is not registered or is closed.
+        """
         with self._changed:
             if not self._run or self._closed:
                 return
@@ -320,6 +352,7 @@ class Stimulus:
         self._neutral_now()
 
     def _end(self, why: str) -> None:
+        """End this program's part for good: call `go_neutral`; `next` raises `StimulusError` with `why` from now on."""
         with self._changed:
             self._why = why
             self._changed.notify_all()
@@ -328,7 +361,10 @@ class Stimulus:
     # The line.
 
     def _keyed(self, token: str, file: str | None) -> str:
-        """The key for this session, from the file or for the link's token."""
+        """Key for this session: from the key `file` if it was made with this link, else traded for the link's token.
+
+        A new key is written to the file. Raises `StimulusError` for a link that is not valid.
+        """
         kept = {}
         if file:  # opened first: the key that the link is traded for has to go somewhere
             with open(os.open(file, os.O_RDWR | os.O_CREAT, 0o600), encoding="utf-8") as opened:
@@ -346,7 +382,10 @@ class Stimulus:
         return found["key"]
 
     def _post(self, path: str, content: Mapping[str, Any]) -> tuple:
-        """Status and content of the answer, on this thread's own connection."""
+        """Send JSON to the server on this thread's own connection; HTTP status and content of the reply.
+
+        A connection that fails is closed, and the exception raised.
+        """
         me = threading.get_ident()
         line = self._lines.get(me) or http.client.HTTPConnection(self._address, timeout=self.silence_s)
         self._lines[me], line.timeout = line, self.silence_s
@@ -360,7 +399,7 @@ class Stimulus:
 
 
 def _read(text: str) -> dict:
-    """What a key file says; nothing if it is none."""
+    """Content of a key file; an empty dict if it is not a JSON object."""
     try:
         found = json.loads(text)
     except ValueError:
@@ -369,6 +408,7 @@ def _read(text: str) -> dict:
 
 
 def _asked(line: http.client.HTTPConnection, path: str, content: Any, headers: Any) -> tuple:
+    """POST `content` as JSON to `path`; HTTP status and decoded JSON of the reply."""
     line.request("POST", path, json.dumps(content, allow_nan=False), {"Content-Type": "application/json", **headers})
     reply = line.getresponse()
     return reply.status, json.loads(reply.read())

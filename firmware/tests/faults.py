@@ -132,7 +132,10 @@ FAULTS = [
 
 
 def is_noticed(fault: Fault) -> bool:
-    """The tests fail on a core with the fault in it. Raises ValueError where the core has changed under the list."""
+    """Run the tests of a fault on a copy of the core that contains it; True if a test fails.
+
+    Raises ValueError if the text to be replaced does not occur exactly once, or if the tests could not run.
+    """
     with tempfile.TemporaryDirectory() as folder:
         core = Path(folder) / "core"
         shutil.copytree(CORE, core)

@@ -42,14 +42,14 @@ class Mutant(NamedTuple):
     new: str
 
     def words(self) -> str:
-        """Where, and what became of what."""
+        """Text for a survivor: file, line, the old code and the new."""
         text = (CORE / self.file).read_text(encoding="utf-8")
         line = text.count("\n", 0, self.start) + 1
         return f"{self.file}:{line}: {text[self.start : self.end].strip()!r} -> {self.new.strip()!r}"
 
 
 def _code(text: str) -> str:
-    """The text with comments and preprocessor lines blanked, place by place."""
+    """The C text with comments and preprocessor lines replaced by blanks, so that positions stay the same."""
 
     def blank(found: re.Match) -> str:
         return re.sub(r"[^\n]", " ", found[0])
@@ -58,7 +58,7 @@ def _code(text: str) -> str:
 
 
 def places(file: str) -> Iterator[Mutant]:
-    """Every mutant of a file."""
+    """Yield every mutant of a file: operators swapped, statements left out, conditions negated, numbers + 1."""
     code = _code((CORE / file).read_text(encoding="utf-8"))
     for found in _SWAP.finditer(code):
         line = code[: found.start()].rsplit("\n", 1)[-1]
@@ -76,7 +76,10 @@ def places(file: str) -> Iterator[Mutant]:
 
 
 def verdict(mutant: Mutant) -> str:
-    """ "noticed", "survives", or "does not compile"."""
+    """Run the default firmware tests on a copy of the core with this mutant.
+
+    Returns "noticed" (a test failed, or all took longer than 120 s), "survives" or "does not compile".
+    """
     with tempfile.TemporaryDirectory() as folder:
         core = Path(folder) / "core"
         shutil.copytree(CORE, core)
@@ -99,6 +102,10 @@ def verdict(mutant: Mutant) -> str:
 
 
 def main() -> None:
+    """Draw and test mutants as the command line asks; print the survivors and the number noticed.
+
+    Exits with a message if the tests fail on the unchanged core.
+    """
     parser = argparse.ArgumentParser()
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
