@@ -81,7 +81,7 @@ class Sampled(eqx.Module):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Names of the coordinates."""
+        """Names of the coordinates: K_inst, K_eff, kappa and alpha, then lag and corner if they are fitted."""
         fitted = [name for name in ("lag", "corner") if _is_fitted(getattr(self, name))]
         return ("K_inst", "K_eff", "kappa", "alpha", *fitted)
 

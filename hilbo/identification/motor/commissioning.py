@@ -48,7 +48,7 @@ class Person(Protocol):
     def encoder_checked(self) -> bool:
         """Return whether the encoder is known to count up into the material.
 
-        If not, ask the person to push the handle in.
+        If it is not, ask the person to push the handle in and return False at once.
         """
         ...
 
@@ -57,7 +57,7 @@ class Person(Protocol):
         ...
 
     def place(self, moved_mm: float) -> float | None:
-        """Return the position of the handle, mm, given `moved_mm` since the start.
+        """Return the handle's position (mm) as the person gives it; `moved_mm`: how far it has moved since the start.
 
         None for a device that is already homed.
         """
@@ -79,11 +79,11 @@ class Bounds(NamedTuple):
     impulse_N_s: float = 0.015
 
     def reach(self, force: float) -> float:
-        """Travel (mm) at which the device ends a nudge of this force (N)."""
+        """Travel (mm) at which the device ends a nudge of this force (N, above 0)."""
         return min(self.travel_mm, self.work_mJ / force) / 2
 
     def lasts(self, force: float, device: Renderer) -> float:
-        """Duration (s) for which this force (N), rising at the slew limit, has the impulse; at least one tick."""
+        """Duration (s) for which this force (N, above 0), rising at the slew limit, has the impulse; a tick or more."""
         slew = device.device.slew_limit_N_per_s
         rise_time = force / (2 * slew)
         duration = self.impulse_N_s / force
@@ -91,7 +91,10 @@ class Bounds(NamedTuple):
         return max(math.floor(seconds / device.tick_s + 1e-6), 1) * device.tick_s
 
     def forces(self, device: Renderer) -> list[float]:
-        """Increasing forces (N) to try, within the limits of this device's encoder and motor."""
+        """Increasing forces (N) to try, each up to 1.5 times the last, within the limits of this device.
+
+        Those are of its motor, and of its encoder, which must detect the movement within the motor's work allowed.
+        """
         motor_limit = min(device.device.force_limit_N, device.condition().continuous_force_N)
         detectable = self.work_mJ / (2 * _FEWEST * device.device.encoder_step_mm)
         most = min(self.most_N, motor_limit, detectable, self.impulse_N_s / device.tick_s)
@@ -126,8 +129,9 @@ def commission(
 ) -> Commissioned:
     """Check the signs of a device, home it, and measure its delay, friction and damping, in this order.
 
-    `say` receives progress messages. Raises `DeviceError` at the first fault, and `InputError` without the person's
-    confirmation.
+    The device moves by itself, and a soft set stays in force. `say` receives progress messages; `bounds` of the nudges,
+    None for the default; `seed` of the order of the sweeps and of the bootstrap. Raises `DeviceError` at the first
+    fault, after an emergency stop for a wrong sign, and `InputError` without the person's confirmation.
     """
     _check_ready(device)
     start_mm = device.status().position_mm
@@ -147,7 +151,10 @@ def commission(
 
 
 def _check_ready(device: Renderer) -> None:
-    """Raise `DeviceError` for a device that cannot nudge, is not STOPPED, or has already exceeded its delay."""
+    """Raise `DeviceError` for a device that cannot nudge, is not STOPPED, or has already exceeded its delay.
+
+    Also if its hardware stop is open.
+    """
     name, status, condition = device.link.name, device.status(), device.condition()
     if not device.can & Capability.DRIVE:
         raise DeviceError(f"{name}: this device cannot move by itself; set HB_CAN_DRIVE in its capabilities.")
@@ -174,7 +181,10 @@ def _check_delay(device: Renderer) -> int:
 
 
 def _check_encoder(device: Renderer) -> None:
-    """Wait for a push by hand with the motor off. Raises `DeviceError` if the position decreases."""
+    """Wait up to 120 s for a push by hand with the motor off.
+
+    Raises `DeviceError` if the position decreases, after an emergency stop, and if nothing moves.
+    """
     least_mm = max(_BY_HAND, 4 * device.device.encoder_step_mm)
     before = device.samples(0.02).position_mm[-1]
 
@@ -192,15 +202,19 @@ def _check_encoder(device: Renderer) -> None:
 
 
 def find_signs(device: Renderer, say: Callable[[str], None], bounds: Bounds) -> tuple[Nudge, ...]:
-    """Nudge the handle inwards, then outwards; return the two nudges. Raises `DeviceError` at the first wrong sign."""
+    """Nudge the handle inwards, then outwards, until it moves each way; return the two nudges that moved it.
+
+    Raises `DeviceError` at the first wrong sign, after an emergency stop, and if the handle does not move. `say`
+    receives progress messages.
+    """
     return tuple(_first_that_moves(device, say, bounds, sign) for sign in (1, -1))
 
 
 def _first_that_moves(device: Renderer, say: Callable[[str], None], bounds: Bounds, sign: int) -> Nudge:
-    """Nudge in direction `sign` with increasing force until the handle moves.
+    """Nudge in direction `sign` (1 inwards, -1 outwards) with increasing force until the handle moves.
 
-    Raises `DeviceError` for a movement the other direction, after an emergency stop, and for no movement at the largest
-    force.
+    Raises `DeviceError` for a movement in the other direction, after an emergency stop, and for no movement at the
+    largest force.
     """
     forces, side = bounds.forces(device), "inwards" if sign > 0 else "outwards"
     for force in forces:
@@ -224,9 +238,10 @@ def _first_that_moves(device: Renderer, say: Callable[[str], None], bounds: Boun
 
 
 def _nudge(device: Renderer, force: float, bounds: Bounds) -> Nudge:
-    """Perform one nudge from rest.
+    """Perform one nudge with `force` (N, positive inwards) from rest, and wait until it has ended.
 
-    Raises `DeviceError` if the device is not at rest before, or not STOPPED after it.
+    `moved_mm` of the result is the largest displacement. Raises `DeviceError` if the device is not at rest before, not
+    STOPPED after it, or sent no telemetry of it.
     """
     steps = device.device
     before = _position_at_rest(device)
@@ -249,7 +264,7 @@ def _nudge(device: Renderer, force: float, bounds: Bounds) -> Nudge:
 
 
 def _position_at_rest(device: Renderer) -> float:
-    """Wait until the handle is at rest and return its position (mm). Raises `DeviceError` if it keeps moving."""
+    """Wait up to 10 s until the handle is at rest and return its position (mm); `DeviceError` if it keeps moving."""
     step = device.device.encoder_step_mm
 
     def position() -> tuple[float] | None:
@@ -260,7 +275,10 @@ def _position_at_rest(device: Renderer) -> float:
 
 
 def _home(device: Renderer, person: Person, moved_mm: float) -> None:
-    """Home the device at the position given by the person, if it is not homed already."""
+    """Home the device at the position given by the person, then have hands taken off; nothing if that is None.
+
+    `moved_mm`: how far the handle has moved since the start.
+    """
     position = person.place(moved_mm)
     if position is not None:
         device.home(position)
@@ -268,9 +286,9 @@ def _home(device: Renderer, person: Person, moved_mm: float) -> None:
 
 
 def _heaviest_set(device: Renderer) -> list[str]:
-    """Put a soft set with the longest memory in force, to maximise the computing time of a tick.
+    """Send a soft set with the longest memory, to maximise the computing time of a tick; it stays in force.
 
-    Returns a note if the device refuses the set.
+    Returns a list: empty, or with a note if the device refuses the set.
     """
     low = {name: ends[0] for name, ends in device.limits().items()}
     taps = device.device.most_taps - (device.device.most_taps + 1) % 2
@@ -283,7 +301,10 @@ def _heaviest_set(device: Renderer) -> list[str]:
 
 
 def _longest_delay(device: Renderer) -> int:
-    """Longest delay since the device's start, µs. Raises `DeviceError` for hardware that reports 0."""
+    """Longest delay since the device's start, µs.
+
+    Raises `DeviceError` if it exceeds the device's configured delay, and for hardware that reports 0.
+    """
     longest = _check_delay(device)
     if longest == 0 and not device.can & Capability.SIMULATED:
         raise DeviceError(
@@ -299,8 +320,10 @@ def delay_for(longest_us: int) -> int:
 
 
 def damping_for(friction: Friction) -> float:
-    """Damping (N·s/m) for a header: the lower end of the interval, rounded down to four digits; 0 where it is not
-    above 0."""
+    """Damping (N·s/m) for a config header: the lower end of the interval, rounded down to four digits, or 0.
+
+    0 where that end is not above 0.
+    """
     return rounded_down(friction.damping.lower) if friction.damping.lower > 0 else 0.0
 
 

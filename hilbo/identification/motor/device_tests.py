@@ -57,9 +57,9 @@ class SelfTest(NamedTuple):
 
 
 def wait_until(device: Renderer, done: Callable[[], Any], what: str, seconds: float = _TIMEOUT) -> Any:
-    """Poll `done` until its value is true and return it. Raises `DeviceError` after `seconds`.
+    """Poll `done` until its value is true and return it; `DeviceError` after `seconds`.
 
-    `what` completes its sentence.
+    `what` completes the sentence "The device has not ... within".
     """
     give_up = device.link.now() + seconds
     while not (value := done()):
@@ -70,9 +70,10 @@ def wait_until(device: Renderer, done: Callable[[], Any], what: str, seconds: fl
 
 
 def drive(device: Renderer, mode: Any, shape: Any, offset: float, amplitude: float = 0.0, **times: Any) -> Samples:
-    """Perform a drive (a motion of the device by itself) and return its samples.
+    """Perform a drive (a motion by the device itself), wait until it has stopped, and return its samples.
 
-    Raises `DeviceError` if it ends early.
+    `times`: `duration` and `period` (s) of `Renderer.drive`, the former required. Samples received earlier are
+    discarded. Raises `DeviceError` if the drive ends early.
     """
     device.samples(0.0)
     device.drive(mode, shape, offset, amplitude, **times)
@@ -101,8 +102,9 @@ def _ended(samples: Samples, begun: int) -> bool:
 def measure_damping(device: Renderer, say: Callable[[str], None], seed: int = 0) -> Friction:
     """Measure damping, Coulomb friction and mass of the free device by triangular sweeps at 24 speeds.
 
-    Nothing may touch the handle. Raises `InputError` if the stroke is too short, `DeviceError` if something touches the
-    handle, and if the line does not carry every tick, since the mean force needs all of them.
+    Nothing may touch the handle. `say` receives progress messages; `seed` of the order of the speeds and of the
+    bootstrap. Raises `InputError` if the stroke is too short, `DeviceError` if something touches the handle, if no
+    friction law fits, and if the line does not carry every tick, since the mean force needs all of them.
     """
     if device.divisor > 1:
         raise DeviceError(
@@ -140,10 +142,11 @@ def characterise(
 ) -> Any:
     """Run the paper's relaxation (`depth` mm held) and creep (`force` N, then `after` N) on the material at position 0.
 
-    Returns the table that `hilbo identify` reads: test, repeat, time_s, position_mm, force_N. Each test begins off the
-    material and at rest; between tests it recovers for `rest` s. Depth and loads vary by up to half a per cent from
-    repeat to repeat, so that the encoder's rounding averages out. Raises `InputError` and `DeviceError`, which is
-    `CutShortError` once a repeat is complete.
+    `hold`: duration (s) of the relaxation and of each half of the creep. Returns the DataFrame that `hilbo identify`
+    reads: test, repeat, time_s, position_mm, force_N. Each test begins off the material and at rest; between tests it
+    recovers for `rest` s. Depth and loads vary by up to half a per cent from repeat to repeat, so that the encoder's
+    rounding averages out. Raises `InputError` for numbers that are not above 0, and `DeviceError`; once a repeat is
+    complete, faults and Ctrl-C raise `CutShortError` with the data so far.
     """
     step, low = device.device.encoder_step_mm, device.device.position_low_mm
     if not (repeats >= 1 and depth > 0 and force > 0 and hold > 0 and rest > 0):  # nor is any of them NaN
@@ -174,19 +177,26 @@ def characterise(
 
 
 def _pressed(device: Renderer, kind: str, before: float, rest: float, *motion: Any, **times: float) -> Pressed:
-    """Run one test with the drive `motion`, after `rest` s at the position `before` (mm)."""
+    """Run one test of a `kind` with the drive `motion` and `times`, after `rest` s at the position `before` (mm)."""
     free = drive(device, "position", "hold", before, duration=rest)
     return pressed(drive(device, *motion, **times), kind, bool(device.can & Capability.FORCE_SENSOR), _noise(free))
 
 
 def _noise(free: Samples) -> float:
-    """Standard deviation of the sensor's force (N) off the material; 0 without a sensor."""
+    """Standard deviation of the sensor's force (N) off the material, over the second half of those samples; else 0.
+
+    0 without a sensor and without such samples.
+    """
     off = free.sensed_N[free.position_mm <= 0]
     return float(np.std(off[off.size // 2 :])) if off.size and not np.isnan(off).any() else 0.0
 
 
 def selftest(device: Renderer, say: Callable[[str], None], echoes: int = 300) -> SelfTest:
-    """Test the loopback of every byte and length, the round-trip time, and the watchdog of a device."""
+    """Test the loopback of messages of every byte and length (`echoes` of them), the round-trip time, and the watchdog.
+
+    The device drives with 0 N, goes into HOLD, and is cleared again. `say` receives progress messages. Raises
+    `InputError` for a device that cannot drive, and `DeviceError` for one that fails otherwise.
+    """
     say("loopback")
     rng, intact = np.random.default_rng(0), 0
     device.link.round_trips.clear()
@@ -212,7 +222,11 @@ def selftest(device: Renderer, say: Callable[[str], None], echoes: int = 300) ->
 
 
 def _watchdog(device: Renderer) -> tuple[int, float]:
-    """Test the watchdog: ticks from the last heartbeat to HOLD, and the force (N) after the ramp."""
+    """Stop the heartbeat in a drive of 0 N: ticks from the last heartbeat to HOLD, and the force (N) after the ramp.
+
+    Clears the HOLD afterwards. Raises `InputError` for a device that cannot drive, and `DeviceError` for a HOLD of
+    another reason or none.
+    """
     if not device.can & Capability.DRIVE:
         raise InputError(
             "This device cannot move by itself, and its watchdog is not tested; start a set, then pull the plug."

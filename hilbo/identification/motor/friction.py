@@ -76,11 +76,10 @@ def sweeps(
 ) -> list[Sweep]:
     """Split the record of a triangular drive, which starts at its middle and rises, into sweeps.
 
-    `period` and `settle` in s.
-
     Each direction gives two sweeps: the `settle` s after the turn, where the servo oscillates and the mass matters, and
-    the rest. `force` (N) is the motor's, along the position (mm); samples every `tick` s. `number`: number of the first
-    period, to join several records. Raises `InputError` for sweeps shorter than twice `settle`.
+    the rest. `force` (N) is the motor's, along the position (mm); samples every `tick` s; `period` (s) of the drive.
+    `number`: number of the first period, to join several records. Raises `InputError` for sweeps shorter than twice
+    `settle`.
     """
     half, skip = round(period / 2 / tick), round(settle / tick)
     recorded, starts = [], range(round(period / 4 / tick), position.size - half + 1, half)  # where the triangle turns
@@ -99,7 +98,7 @@ def sweeps(
 
 
 def _sweep(x: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], tick: float, period: int) -> Sweep:
-    """Weighted means of one sweep of positions `x` (mm) and forces (N).
+    """Weighted means of one sweep of positions `x` (mm) and forces (N), sampled every `tick` s; `period`: its number.
 
     A force is constant from its sample to the next.
     """
@@ -118,7 +117,8 @@ def _sweep(x: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], tick: flo
 def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
     """Estimate friction by least squares over the sweeps, by the simplest law that fits.
 
-    Intervals by bootstrap over periods.
+    Intervals by bootstrap over periods. Raises `InputError` for fewer than 8 periods or a single speed, and
+    `DeviceError` if every law is rejected.
     """
     values = np.array([[s.force, s.velocity, s.acceleration] for s in sweeps])
     periods, period = np.unique([s.period for s in sweeps], return_inverse=True)
@@ -144,8 +144,8 @@ def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
 def _fitting(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> list[tuple[Law, Blocks]]:
     """Laws that fit the sweeps, simplest first, each with its least-squares problem.
 
-    Only the simplest law if it is not rejected; else those within 1.25 times the least sum of squares. `way`:
-    direction, 1 or -1. Raises `DeviceError` if every law is rejected.
+    Only the simplest law if it is not rejected; else those within 1.25 times the least sum of squares. `speed` in mm/s;
+    `way`: direction, 1 or -1. Raises `DeviceError` if every law is rejected.
     """
     simplest, *others = candidates(speed, way)
     if not refuted(blocks, speed, way):
@@ -164,7 +164,7 @@ def _fitting(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarr
 
 
 def _intervals(blocks: Blocks, seed: int) -> list[Interval]:
-    """Estimates of all terms with basic bootstrap intervals over periods."""
+    """Estimates of all terms, in their order, with basic 95 % bootstrap intervals over periods."""
     count, best = int(blocks.period.max()) + 1, blocks.best
     products = blocks.terms[:, :, None] * blocks.terms[:, None, :]
     sums = np.zeros((count, *products.shape[1:])), np.zeros((count, best.size))

@@ -38,7 +38,7 @@ class Blocks(NamedTuple):
     period: np.ndarray
 
     def with_term(self, law: Law) -> "Blocks":
-        """Copy with the additional term of a law."""
+        """Copy with the additional term of a law as the last column; the object itself for a law without one."""
         return self if law.term is None else self._replace(terms=np.column_stack([self.terms, law.term]))
 
     @property
@@ -64,7 +64,10 @@ class Blocks(NamedTuple):
 
 
 def candidates(speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> Iterator[Law]:
-    """Yield the candidate laws for sweeps with a `speed` (mm/s) in the direction `way` (1 or -1), simplest first."""
+    """Yield the candidate laws for sweeps, simplest first; the third with δ = 1 and 2 and several v_s.
+
+    `speed` (mm/s) > 0 and direction `way` (1 or -1) of each sweep.
+    """
     yield Law(LAWS[0], None)
     yield Law(LAWS[1], way * (speed / 1e3) ** 2)
     for sharpness in (1, 2):
@@ -73,7 +76,11 @@ def candidates(speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> 
 
 
 def refuted(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> bool:
-    """Whether terms quadratic and cubic in the logarithm of the speed (mm/s) are significant on top of a law."""
+    """Whether the sweeps reject the law whose terms are in `blocks`, at a significance of 0.002.
+
+    They do if terms quadratic and cubic in the logarithm of the `speed` (mm/s) are significant on top of it. `way`:
+    direction of each sweep, 1 or -1.
+    """
     log_speed = np.log(speed / np.median(speed))
     free = way[:, None] * np.stack([log_speed**2, log_speed**3], axis=1)
     extended = blocks._replace(terms=np.hstack([blocks.terms, free]))
@@ -81,7 +88,7 @@ def refuted(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarra
 
 
 def wald(blocks: Blocks, last: int) -> float:
-    """p value of the Wald test that the `last` terms are 0."""
+    """p value of the Wald test, clustered by period, that the coefficients of the `last` so many terms are 0."""
     from scipy.stats import f as fisher
 
     count, free = int(blocks.period.max()) + 1, blocks.terms.shape[1]

@@ -24,9 +24,10 @@ _STAY = 5  # samples, shortest loss of contact
 
 
 class Pressed(NamedTuple):
-    """One test, from the last sample off the material on.
+    """One test, from the last sample off the material on: position (mm) and force (N), both positive into the material.
 
-    `off` marks samples without contact after the first contact.
+    The position is never below 0, and the force is 0 without contact. `off` marks samples without contact after the
+    first contact.
     """
 
     position: Float[np.ndarray, " n"]
@@ -35,10 +36,9 @@ class Pressed(NamedTuple):
 
 
 def pressed(seen: Samples, kind: str, sensed: bool, noise: float) -> Pressed:
-    """Cut one test out of the samples.
+    """Cut one test of a `kind`, "relaxation" or "creep", out of the samples.
 
-    Its force is the sensor's with noise `noise` (N), or without a sensor the motor's.
-
+    `sensed`: the force is the sensor's, with noise `noise` (N), else the motor's, which shows no loss of contact.
     Raises `DeviceError` if there was no contact at position 0.
     """
     inside = np.flatnonzero(seen.position_mm > 0)
@@ -52,7 +52,10 @@ def pressed(seen: Samples, kind: str, sensed: bool, noise: float) -> Pressed:
 
 
 def _contact_lost(force: Float[np.ndarray, " n"], noise: float) -> Bool[np.ndarray, " n"]:
-    """Samples without contact after the first contact, in runs of `_STAY` or more."""
+    """Mask of the samples without contact after the first contact, in runs of `_STAY` or more.
+
+    `force` (N) of the sensor, positive into the material; `noise`: its standard deviation (N).
+    """
     smooth = np.convolve(force, np.ones(_STAY) / _STAY, "same")
     off = smooth < max(_SURE * noise / np.sqrt(_STAY), _LEAST)
     edges = np.flatnonzero(np.diff(off, prepend=True, append=False))  # starts and ends of contact
@@ -63,9 +66,10 @@ def _contact_lost(force: Float[np.ndarray, " n"], noise: float) -> Bool[np.ndarr
 
 
 def table_of(tests: Mapping[str, Sequence[Pressed]], last: Mapping[str, float], tick: float) -> Any:
-    """Table of the tests: test, repeat, time_s, position_mm, force_N; the repeats of a test share their times.
+    """DataFrame of the tests: test, repeat, time_s, position_mm, force_N; the repeats of a test share their times.
 
-    `last`: duration (s) of each kind of test; `tick` in s.
+    They end with the shortest repeat, or at `last`, the duration (s) by kind of test. Rows are left out for all repeats
+    where any of them has lost contact (module docstring). `tick`: time (s) between samples.
     """
     import pandas as pd
 
@@ -83,7 +87,7 @@ def table_of(tests: Mapping[str, Sequence[Pressed]], last: Mapping[str, float], 
 
 
 def _interior(off: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Mask without the first and last sample of each run."""
+    """Mask without the first and last sample of each run of True."""
     inner = off.copy()
     inner[1:] &= off[:-1]
     inner[:-1] &= off[1:]
