@@ -81,7 +81,10 @@ def is_position_clearer(test: Test) -> bool:
 
 
 def is_fitted_in_force(test: Test) -> bool:
-    """Whether a creep test is fitted with force as its output, because its force is the noisier channel."""
+    """Whether a creep test is fitted with force as its output, because its force is the noisier channel.
+
+    False for other tests.
+    """
     return test.kind == "creep" and is_position_clearer(test)
 
 

@@ -280,7 +280,7 @@ def _bootstrap(
 
 
 def _variance_of_mean(values: Float[Array, "*m p"], axis: int) -> Float[Array, "..."]:
-    """Variance of the mean over the repeats, along `axis`."""
+    """Variance of the mean of the repeats, which are along `axis`: their sample variance / their number."""
     return jnp.var(values, axis=axis, ddof=1) / values.shape[axis]
 
 

@@ -44,11 +44,11 @@ class Continuous(eqx.Module):
     kinds = ("modulus", "compliance")
 
     def physical(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-        """Masks of the bounds that are physical limits: the lower bound K_eff = 0."""
+        """Masks of the lower and of the upper bounds that are physical limits: of them all only K_eff = 0."""
         return (False, True, False, False), (False,) * 4
 
     def at(self, tests: Sequence[Test]) -> "Continuous":
-        """Model with the reference time t0 at the geometric middle of the tests' times."""
+        """Copy of the model with the reference time t0 at the geometric middle of the tests' times."""
         times = np.concatenate([test.time for test in tests])
         return Continuous(self.weights, jnp.asarray(np.sqrt(times.min() * times.max())))
 
@@ -67,7 +67,7 @@ class Continuous(eqx.Module):
         return np.array([[1.2 * top, 0.5 * last, np.log(kappa), np.log(a / (1 - a))] for kappa, a in pairs])
 
     def prepare(self, test: Test) -> Curve:
-        """Convert a test to a `Curve`, with the scale of its residuals."""
+        """Convert a test of moduli to a `Curve`, with the scale of its residuals by `weights`."""
         return _prepare(test, self.weights)
 
     def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
@@ -102,7 +102,7 @@ class FractionalMaxwell(eqx.Module):
     kinds = ("modulus",)
 
     def physical(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-        """Masks of the bounds that are physical limits: α <= 1 and β >= 0."""
+        """Masks of the lower and of the upper bounds that are physical limits: β >= 0 and α <= 1."""
         return (False, False, False, True), (False, False, True, False)
 
     def at(self, tests: Sequence[Test]) -> "FractionalMaxwell":
@@ -128,7 +128,7 @@ class FractionalMaxwell(eqx.Module):
         return np.array([[top - 1, middle + later, alpha, ratio] for later, alpha, ratio in shapes])
 
     def prepare(self, test: Test) -> Curve:
-        """Convert a test to a `Curve`, with the scale of its residuals."""
+        """Convert a test of moduli to a `Curve`, with the scale of its residuals by `weights`."""
         return _prepare(test, self.weights)
 
     def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:

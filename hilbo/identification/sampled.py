@@ -86,7 +86,7 @@ class Sampled(eqx.Module):
         return ("K_inst", "K_eff", "kappa", "alpha", *fitted)
 
     def physical(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-        """Masks of the bounds that are physical limits: the lower bound K_eff = 0, and the highest filter corner."""
+        """Masks of the lower and of the upper bounds that are physical limits: K_eff = 0, the highest filter corner."""
         upper = tuple(name == "corner" for name in self.labels)
         return tuple(name == "K_eff" for name in self.labels), upper
 

@@ -42,7 +42,10 @@ class GLSums(eqx.Module):
 
 
 def sums(alpha: Real[ArrayLike, ""], span: Span) -> GLSums:
-    """C(1), C(-1), their difference and the first moment for one order α, with either memory. `alpha` is a scalar."""
+    """C(1), C(-1), their difference and the first moment for one order α, with either memory. `alpha` is a scalar.
+
+    Computed by NumPy for a NumPy `alpha` and short memory, else by JAX.
+    """
     if span.memory == "short":
         return _gl_sums(alpha, span.N) if on_host(alpha) else gl_sums(alpha, span.N)
     alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha))

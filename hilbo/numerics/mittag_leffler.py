@@ -51,7 +51,7 @@ def mittag_leffler_two(
 
 @jax.jit
 def mittag_leffler_increment(alpha: Real[ArrayLike, "..."], z: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """(1 - E_α(-z))/z, which is E_{α,1+α}(-z), elementwise; 1/Γ(1 + α) at z = 0."""
+    """(1 - E_α(-z))/z, which is E_{α,1+α}(-z), for 0 < α <= 1 and z >= 0, elementwise; 1/Γ(1 + α) at z = 0."""
     dtype = jnp.result_type(1.0, alpha, z)
     return jnp.vectorize(_increment)(jnp.asarray(alpha, dtype), jnp.asarray(z, dtype))
 

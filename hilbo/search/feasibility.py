@@ -77,9 +77,10 @@ def _slack(physical: _Physical) -> float:
 
 
 def minimum_damping(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
-    """Smallest device damping (N·s/m) for which parameter sets are passive, at every delay up to the study's.
+    """Smallest device damping (N·s/m) for which parameter sets are passive at delays from 0 to the study's; no margin.
 
-    The needed damping first falls with the delay and then rises, so the larger value at both ends is sufficient.
+    `physical`: parameter -> values in its unit, of one shape; so is the result. The needed damping first falls with the
+    delay and then rises, so the larger value at both ends is sufficient.
     """
     place = *_model_parameters(physical), m.K_eff, m.N, m.T
     prompt = passivity.minimum_damping(*place, memory=m.memory)
@@ -89,13 +90,16 @@ def minimum_damping(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
 
 
 def K0_of(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
-    """K0 (N/mm) of parameter sets, from the effective stiffness."""
+    """K0 (N/mm) of parameter sets, so that their static stiffness is `m.K_eff`; of the shape of the values."""
     K1, B1, alpha = _model_parameters(physical)
     return viscoelastic.K0_from_effective_stiffness(K1, B1, alpha, m.K_eff, m.N, m.T, memory=m.memory)
 
 
 def largest_K1(m: Mechanics, B1: _Batch, alpha: _Batch) -> _Batch:
-    """Largest K1 (N/mm) that is passive with the search margin, without delay and at the study's delay."""
+    """Largest K1 (N/mm) that is passive with the search margin, without delay and at the study's delay.
+
+    inf if every K1 is passive, 0 if none is.
+    """
     place = B1, alpha, m.damping * (1 - SEARCH_MARGIN), m.K_eff, m.N, m.T
     prompt = passivity.largest_K1(*place, memory=m.memory)
     if m.delay == 0:

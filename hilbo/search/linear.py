@@ -83,7 +83,7 @@ def check_room(parameters: Sequence[Parameter], constraints: Sequence[Constraint
 
 
 def _ordinal(number: int) -> str:
-    """Ordinal number in words."""
+    """Ordinal number in words up to "third"; for other numbers such as "4th"."""
     return {1: "first", 2: "second", 3: "third"}.get(number, f"{number}th")
 
 

@@ -49,8 +49,9 @@ _CLUSTERED = 200  # points for each of a space-filling design between walls
 class SearchSpace(eqx.Module):
     """Named parameters; with `mechanics` the passive part of their box, with `constraints` what they leave.
 
-    With mechanics the parameters must include K1 (N/mm), B1 (N·s^α/mm) and alpha, in any order. Raises InputError if
-    no column (B1, alpha) holds a passive K1, or if the constraints leave nothing.
+    With mechanics the parameters must include K1 (N/mm), B1 (N·s^α/mm) and alpha, in any order. Raises InputError if no
+    column (B1, alpha) holds a passive K1, or if the constraints leave nothing. So do methods for points with another
+    number of coordinates.
     """
 
     parameters: tuple[Parameter, ...] = eqx.field(static=True)
@@ -113,7 +114,7 @@ class SearchSpace(eqx.Module):
 
     @property
     def _drawn(self) -> Columns | None:
-        """Columns from which uniform points are drawn; None without mechanics."""
+        """Columns from which uniform points are drawn (`Columns.drawn`); None without mechanics."""
         return None if self.columns is None else self.columns.drawn
 
     @property
@@ -158,7 +159,7 @@ class SearchSpace(eqx.Module):
     def to_physical(self, unit: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
         """Unit cube to physical values, last axis = parameter; exact at both ends, and never outside them.
 
-        (..., d) -> (..., d); each parameter in its own unit.
+        (..., d) -> (..., d); each parameter in its own unit. Discrete parameters are rounded to the nearest value.
         """
         self._check_axis(unit)
         points = floating(unit)

@@ -328,6 +328,6 @@ def damping_for(friction: Friction) -> float:
 
 
 def rounded_down(value: float) -> float:
-    """A positive number rounded down to four digits."""
+    """A number above 0, rounded down to four significant digits."""
     least = 10.0 ** (math.floor(math.log10(value)) - 3)
     return math.floor(value / least) * least
