@@ -41,6 +41,7 @@ class OptimisticScore(Protocol):
 
     def __call__(self, mean: Float[Array, "..."], variance: Float[Array, "..."], /) -> Float[Array, "..."]:
         """Score of posterior means and variances, elementwise."""
+        ...
 
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""], /) -> Float[Array, "..."]:
         """Upper bound of the score given the posterior mean, over variances from 0 to `prior`.
