@@ -23,7 +23,7 @@ sys.path[:0] = [str(Path(__file__).parents[1])]
 
 from attacks.support import damaged, main
 from hilbo.device import link
-from hilbo.device.frames import Frame, closed
+from hilbo.device.frames import Frame, encoded_frame
 from hilbo.device.messages import MESSAGES
 
 __all__ = ["Frames", "host_takes"]
@@ -96,7 +96,7 @@ def host_takes(rng: random.Random, count: int) -> str:
     good, wire = set[Frame](), []
     for _ in range(count):
         frame = Frame(rng.choice([*MESSAGES, rng.randrange(256)]), rng.randrange(256), rng.randbytes(rng.randrange(65)))
-        data = closed(frame)
+        data = encoded_frame(frame)
         kind = rng.random()
         if kind < 0.5:
             good.add(frame)

@@ -167,7 +167,7 @@ class Renderer:
             self._buffer = TelemetryBuffer(self.device.encoder_step_mm)
             self._link.on_telemetry = self._buffer.add
             self.notes += take_over(self._link, self.device)
-            if self._link.ours:
+            if self._link.simulated_time:
                 self._link.pause(self.tick_s)  # a device knows its position from its first tick on
             self.stream()
         except BaseException:
@@ -326,7 +326,8 @@ class Renderer:
         return self.samples(seconds).table(self.tick_s)
 
     def samples(self, seconds: SupportsFloat = 1.0) -> Samples:
-        """Telemetry and errors as of `telemetry`, as arrays (n,) instead of a pandas table."""
+        """Telemetry as arrays (n,): samples since `start` or the last call, after `seconds` more of the device's time.
+        Raises `InputError` for a time that is not finite, `DeviceError` if the line is lost or no telemetry comes."""
         if not math.isfinite(float(seconds)):
             raise InputError(f"The time is {seconds} s; give a number.")
         buffer, quiet, ticks = self._buffer, 0, float(seconds) / self.tick_s
@@ -334,7 +335,7 @@ class Renderer:
         while buffer.tick - first < ticks:
             if self._more():
                 quiet, first = 0, first or buffer.tick
-                pieces += [buffer.take()] if buffer.much else []
+                pieces += [buffer.take()] if buffer.over_half_full else []
             elif self._link.lost:
                 raise DeviceError(self._link.lost)
             elif self._link.restarted or (quiet := quiet + 1) > _STALLED:
@@ -345,7 +346,7 @@ class Renderer:
     def _more(self) -> bool:
         """Wait for telemetry for up to `_POLL` s (of simulated time half of that); return whether any came."""
         seen = self._buffer.counts()
-        if self._link.ours:
+        if self._link.simulated_time:
             self._link.pause(_POLL / 2)
         else:
             self._buffer.wait(_POLL)

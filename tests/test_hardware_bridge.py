@@ -339,7 +339,7 @@ def test_telemetry_that_nobody_asked_for_is_given_up_and_counted(monkeypatch):
     buffer = TelemetryBuffer(0.0127)
     for tick in range(0, 15, 3):
         buffer.add(frame(tick))
-    assert buffer.much and buffer.counts().unread == 6
+    assert buffer.over_half_full and buffer.counts().unread == 6
     assert list(buffer.take().tick) == list(range(6, 15))
 
 

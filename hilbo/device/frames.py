@@ -9,7 +9,7 @@ Overhead Byte Stuffing.
 import zlib
 from typing import NamedTuple
 
-__all__ = ["LONGEST", "PAYLOAD", "Frame", "Receiver", "WireError", "closed", "opened"]
+__all__ = ["LONGEST", "PAYLOAD", "Frame", "Receiver", "WireError", "decoded_frame", "encoded_frame"]
 
 PAYLOAD = 64  # bytes
 LONGEST = 71  # bytes of a frame without its 0x00
@@ -27,7 +27,7 @@ class Frame(NamedTuple):
     payload: bytes
 
 
-def closed(frame: Frame) -> bytes:
+def encoded_frame(frame: Frame) -> bytes:
     """Encode a frame as bytes for the line: body, CRC-32, COBS and the final 0x00.
 
     Raises `WireError` for a payload of more than 64 bytes. Bodies are shorter than 254 bytes, so that COBS needs no
@@ -40,7 +40,7 @@ def closed(frame: Frame) -> bytes:
     return b"".join(bytes((len(run) + 1,)) + run for run in body.split(b"\0")) + b"\0"
 
 
-def opened(frame: bytes) -> Frame:
+def decoded_frame(frame: bytes) -> Frame:
     """Decode the bytes of a frame, given without its 0x00, and check its CRC-32.
 
     Raises `WireError` for a damaged frame: too long or short, invalid COBS, or a wrong CRC.
@@ -73,7 +73,7 @@ class Receiver:
         frames = []
         for frame in filter(None, complete):
             try:
-                frames.append(opened(frame))
+                frames.append(decoded_frame(frame))
             except WireError:
                 self.dropped += 1
         return frames

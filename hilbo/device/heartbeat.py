@@ -25,9 +25,9 @@ from typing import Any
 
 if __name__ == "__main__":
     sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
-    from frames import Frame, Receiver, closed  # type: ignore[import-not-found]
+    from frames import Frame, Receiver, encoded_frame  # type: ignore[import-not-found]
 else:
-    from hilbo.device.frames import Frame, Receiver, closed
+    from hilbo.device.frames import Frame, Receiver, encoded_frame
 
 __all__ = [
     "BEAT",
@@ -213,7 +213,7 @@ def keep_beating(line: int, boot_id: int, tick: int, signs: int, out: int, grace
             return
         if now >= due:
             if not quiet:
-                _write(line, closed(Frame(HEARTBEAT, 0, struct.pack("<II", boot_id, heard.tick))))
+                _write(line, encoded_frame(Frame(HEARTBEAT, 0, struct.pack("<II", boot_id, heard.tick))))
             due = max(due + BEAT, now)
 
 

@@ -207,7 +207,7 @@ class Link:
         if boot_id is None:
             return
         self.heartbeat()
-        if self.ours:
+        if self.simulated_time:
             return
         self._arrivals.hand_over()
         try:
@@ -253,13 +253,13 @@ class Link:
             heart.hush(quiet)
 
     @property
-    def ours(self) -> bool:
+    def simulated_time(self) -> bool:
         """Whether the device's time is simulated, and passes only in `pause`."""
         return self._ticks is not None
 
     def now(self) -> float:
         """Time (s, arbitrary origin) of the clock that `pause` uses."""
-        return self._passed / 1000 if self.ours else time.monotonic()
+        return self._passed / 1000 if self.simulated_time else time.monotonic()
 
     def pause(self, seconds: float) -> None:
         """Wait for `seconds`. With simulated time: advance the device by as much, at least 1 ms, with heartbeats, and

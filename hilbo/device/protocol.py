@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import fields
 from typing import NamedTuple, get_args, get_type_hints
 
-from hilbo.device.frames import PAYLOAD, Frame, WireError, closed, opened
+from hilbo.device.frames import PAYLOAD, Frame, WireError, decoded_frame, encoded_frame
 from hilbo.device.messages import (
     MESSAGES,
     VERSION,
@@ -140,9 +140,9 @@ def _unpack_rows(kind, layout, values, rest):
 def encode(message: Message, seq: int) -> bytes:
     """Encode a message with sequence number `seq` as the bytes of a frame, including the final 0x00.
 
-    Raises `WireError` as `payload_of` does.
+    Raises `WireError` for a number that does not fit its field, or too long a payload.
     """
-    return closed(Frame(code_of(type(message)), seq, payload_of(message)))
+    return encoded_frame(Frame(code_of(type(message)), seq, payload_of(message)))
 
 
 def frames_in(capture: bytes) -> Iterator[tuple[int, Message | WireError, Frame | None]]:
@@ -153,7 +153,7 @@ def frames_in(capture: bytes) -> Iterator[tuple[int, Message | WireError, Frame 
         frame = None
         if raw:
             try:
-                frame = opened(raw)
+                frame = decoded_frame(raw)
                 yield offset, decode(frame), frame
             except WireError as error:
                 yield offset, error, frame

@@ -102,7 +102,7 @@ class TelemetryBuffer:
             return Counts(self._samples, self._dropped, self._missing, self._unread)
 
     @property
-    def much(self) -> bool:
+    def over_half_full(self) -> bool:
         """Whether the buffer is more than half full, so that `take` should be called."""
         return len(self._messages) > _MOST // 2
 

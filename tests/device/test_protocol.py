@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilbo.device import frames, protocol, reasons
-from hilbo.device.frames import LONGEST, Frame, Receiver, WireError, opened
+from hilbo.device.frames import LONGEST, Frame, Receiver, WireError, decoded_frame
 from hilbo.device.messages import (
     MESSAGES,
     SCHEMA,
@@ -101,7 +101,7 @@ def test_a_message_comes_back(drawn, seq):
 @given(st.binary(max_size=64), st.integers(0, 255), st.integers(0, 255))
 def test_a_frame_of_any_bytes_comes_back(payload, kind, seq):
     frame = Frame(kind, seq, payload)
-    assert opened(frames.closed(frame)[:-1]) == frame
+    assert decoded_frame(frames.encoded_frame(frame)[:-1]) == frame
 
 
 @given(messages(), messages())
@@ -232,7 +232,7 @@ def test_golden_frames():
     seen = set()
     for name, kind, seq, payload, frame in lines:
         body = Frame(int(kind, 16), int(seq, 16), b"" if payload == "-" else bytes.fromhex(payload))
-        assert frames.closed(body).hex() == frame.lower(), name
+        assert frames.encoded_frame(body).hex() == frame.lower(), name
         (received,) = Receiver().feed(bytes.fromhex(frame))
         assert received == body, name
         if body.type in MESSAGES:

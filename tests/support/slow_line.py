@@ -14,7 +14,7 @@ import tty
 from collections import deque
 
 from hilbo.device import messages, protocol
-from hilbo.device.frames import Receiver, WireError, opened
+from hilbo.device.frames import Receiver, WireError, decoded_frame
 
 __all__ = ["SlowLine"]
 
@@ -94,7 +94,7 @@ class SlowLine:
         if self.lose is None:
             return data
         frames = [part for part in data.split(b"\0") if part]
-        return b"".join(part + b"\0" for part in frames if opened(part).type != messages.code_of(self.lose))
+        return b"".join(part + b"\0" for part in frames if decoded_frame(part).type != messages.code_of(self.lose))
 
     def _see(self, data: bytes) -> None:
         for frame in self._receiver.feed(data):

@@ -198,7 +198,8 @@ class HostRenderer:
             raise InputError(self.sentence())
 
     def start(self, stops: int) -> None:
-        """Start rendering, from out of contact; `stops` is that of the `state()` inspected before.
+        """Start rendering, from out of contact; `stops`: the count of stops in the `state()` that the caller has
+        inspected.
 
         Raises `DeviceError` if the library refuses, such as after another stop.
         """
@@ -206,7 +207,8 @@ class HostRenderer:
             raise DeviceError(self.sentence())
 
     def clear(self, stops: int) -> None:
-        """Change from HOLD or ESTOP to STOPPED; `stops` as in `start`. Raises `DeviceError` if the library refuses."""
+        """Change from HOLD or ESTOP to STOPPED; `stops`: the count of stops in the `state()` that the caller has
+        inspected. Raises `DeviceError` if the library refuses, such as after another stop."""
         if self._lib.hilbo_clear(self._handle, stops):
             raise DeviceError(self.sentence())
 
@@ -223,8 +225,8 @@ class HostRenderer:
         self._lib.hilbo_heartbeat(self._handle)
 
     def tick(self, position_mm: float, velocity_mm_per_s: float, time_s: float) -> float:
-        """Advance the renderer by one period and return the force (N) to output. NaN for a quantity that the device
-        does not provide."""
+        """Advance the renderer by one period and return the force (N) to output, given position, velocity and time (s);
+        NaN for a quantity that the device does not provide."""
         return self._tick(self._handle, position_mm, velocity_mm_per_s, time_s)
 
     def state(self) -> HostState:

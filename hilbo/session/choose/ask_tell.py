@@ -96,8 +96,8 @@ class Session:
 
     @classmethod
     def replay(cls, study: Study, responses: Iterable[str], seed: int = 0) -> "Session":
-        """Session after these responses to its proposals, in this order. Raises `InputError` as `start` and `tell`
-        do."""
+        """Session after these responses to its proposals, in this order. Raises `InputError` for a study, seed or
+        response that is not valid, and for too many responses."""
         session = cls.start(study, seed)
         for response in responses:
             session = session.tell(response)
@@ -180,8 +180,8 @@ class Session:
 
 
 def _in_its_digits(parameter: Parameter, value: Any) -> float:
-    """A given value as a physical number (the index of a level). A float32 is read by its shortest decimal: 0.99 is
-    0.99, not 0.9900000095, which is beyond the end of the range."""
+    """A given value as a physical number: the index of a level (NaN if it is unknown), else its float. A float32 is
+    read by its shortest decimal: 0.99 is 0.99, not 0.9900000095, which is beyond the end of the range."""
     if parameter.levels:
         return parameter.number(str(value))
     dtype = getattr(value, "dtype", np.dtype(float))

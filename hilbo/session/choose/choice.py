@@ -187,7 +187,8 @@ def _highest_apart(study, plan, posterior, excluded):
 
 @program
 def _highest_of_map(study, warm, posterior, excluded):
-    """The same among the candidates of the warm start."""
+    """Candidate (d,) of the warm start with the highest UCB at least `APART` from the excluded points (r, d), which are
+    in the unit cube; the result is in physical units."""
     return study.space.to_physical(warm_point(study, warm, posterior, excluded, APART))
 
 
@@ -236,6 +237,6 @@ def explained(study: Study, posterior: Posterior, point: Float[np.ndarray, " d"]
 
 
 def _finite(values: dict[str, Any]) -> dict[str, Any]:
-    """Copy without entries that are not finite floats, also in nested dicts; NaN and infinity are removed."""
+    """Copy without NaN and infinite floats, also in nested dicts; all other values are kept."""
     kept = {key: _finite(value) if isinstance(value, dict) else value for key, value in values.items()}
     return {key: value for key, value in kept.items() if not isinstance(value, float) or math.isfinite(value)}

@@ -70,8 +70,8 @@ class LoggedSession:
         return None if self.state.pending is None else self.state.pending.renderings["a"]
 
     def tell(self, response: str, **others: str) -> None:
-        """Log the answer to the pending trial; for a comparison `response` is class_a (or preferred, if only that is
-        asked), and `others` are class_b and preferred.
+        """Log the answer to the pending trial. `response` answers the first question of its phase, `others` the further
+        ones of a comparison, by name: class_b, preferred.
 
         Raises `InputError` if nothing has been asked, and RefusedError for an answer that is not valid.
         """

@@ -93,8 +93,11 @@ def next_point(
 def point_after(
     choosing: Choosing, plan: Design, posterior: Posterior, trial: Int[Array, ""] | int, weight: ArrayLike
 ) -> Float[Array, " d"]:
-    """The next point (d,) of the unit cube, by the acquisition, from the posterior of the answers; arguments as in
-    `next_point`."""
+    """The next point (d,) of the unit cube, by the acquisition, from the posterior of the answers; traceable.
+
+    `trial`: index of the trial, which seeds Thompson's draw; `weight`: of the standard deviation in UCB. Never a
+    space-filling point.
+    """
     thompson, distance = choosing.selection.acquisition == "thompson", choosing.selection.minimum_distance
     allowed = None
     if distance:
@@ -122,7 +125,7 @@ def _highest(
     choosing: Choosing, plan: Design, posterior: Posterior, score: OptimisticScore, allowed: Callable | None = None
 ) -> Choice:
     """Maximise a score over the feasible set: screening in float32 on the design's points, then polishing. `allowed`:
-    further condition on a point (d,), or None."""
+    further condition on a point (d,), or None. Returns the point and how it was found."""
 
     def score_at(x):
         """Score at the point x (d,)."""

@@ -20,8 +20,8 @@ def netcdf(sessions: Sequence[LiveSession], path: Path, study: StudyFile) -> boo
     flags) as a netCDF file, for xarray (DataTree) and ArviZ (InferenceData). Return False, and write nothing, if there
     are none.
 
-    Groups, along `obs_id`: observed_data has `category` (from 0), constant_data participant, session, trial and
-    parameters, levels by their names. Attributes name the study.
+    Groups, along `obs_id`: observed_data has `category` (from 0), constant_data the parameters (levels by their names)
+    and the columns that identify a trial, such as participant. Attributes name the study.
     """
     table = trials_table(sessions)
     if len(table):

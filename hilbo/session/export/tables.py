@@ -101,8 +101,8 @@ def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
 
 
 def validation_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """Table of all comparisons that count, one row each; with a stimulus program also the values that it confirmed,
-    which may differ from the planned sets."""
+    """Table of all comparisons that count, one row each, without repetitions; with a stimulus program also the values
+    that it confirmed, which may differ from the planned sets."""
     rows = []
     for state in sessions:
         for trial in state.trials:
@@ -133,8 +133,8 @@ def _confirmed(study: StudyFile, trial: Trial) -> dict[str, float | str]:
 
 
 def sets_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """Table of the planned sets of comparisons, one row each. Raises InputError if two sets have the same name. With
-    mechanics it loads JAX, to compute K0."""
+    """Table of the planned sets of comparisons, one row each; with mechanics JAX is loaded to compute K0. Raises
+    InputError if two different sets have the same name."""
     rows: dict[str, dict[str, Any]] = {}
     for state in sessions:
         for block in state.header.blocks:
@@ -191,8 +191,8 @@ def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
 
 
 def sessions_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """Table of sessions, one row each: phases, hash of the plan (empty without a plan), seed, and number and longest
-    (s) of the pauses."""
+    """Table of sessions, one row each: participant, session, phases, hash of the plan (empty without a plan), seed, and
+    number and longest (s) of the pauses."""
     rows = []
     for state in sessions:
         header = state.header
@@ -209,7 +209,8 @@ def log_cells(
 ) -> list[pd.DataFrame]:
     """The trial table of a folder of session logs as one frame of text cells, in a list. `study` has all materials.
 
-    `note` as in `read_sessions`. Raises InputError, also if there are no answers.
+    `note` is called with sentences on logs and dry runs that are left out. Raises InputError for logs that are damaged
+    or of another study, and if there are no answers.
     """
     table = trials_table(read_sessions(folder, study, note))
     if table.empty:
@@ -224,8 +225,11 @@ def read_log_trials(
     *,
     note: Callable[[str], object] = lambda sentence: None,
 ) -> TrialTable:
-    """The trial table of a folder of session logs, of one `material` if it is given. `study` has all materials. Raises
-    InputError as `read_sessions` and `trial_table` do; `note` is called with their notes."""
+    """The trial table of a folder of session logs, of one `material` if it is given. `study` has all materials.
+
+    `note` is called with sentences on what is left out. Raises InputError for logs that are damaged or of another
+    study, if there are no answers, and for rows that `trial_table` refuses.
+    """
     chosen = study.material(material) if material and study.materials else study
     return trial_table(log_cells(folder, study, note), chosen, material, source=str(folder), note=note)
 

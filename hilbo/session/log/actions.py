@@ -85,7 +85,7 @@ def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event
     """Event: a rendering is in force. `facts`: what a device reports (CRC, values read back, times), or `values`, those
     that a stimulus program confirms. Raises RefusedError for a trial that is not pending or lacks the side, and for
     values beyond the tolerance."""
-    pending = _live(state, trial)
+    pending = _pending_trial(state, trial)
     if side not in pending.renderings:
         raise RefusedError("bad-answer", f'trial {trial} has no side "{side}".')
     if state.study.stimulus is not None:
@@ -98,7 +98,7 @@ def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> E
     """Event: step `step` (from 0) of a pending trial begins (`on`) or ends. Raises `RefusedError` if the trial is not
     pending or has no such step; and for a beginning, during a break, after the end, or with a rendering that is not
     confirmed."""
-    pending = _live(state, trial)
+    pending = _pending_trial(state, trial)
     if on and state.screen != "trial":
         raise RefusedError("paused", f"no step of trial {trial} begins now: the screen shows {state.screen}.")
     steps = state.steps_of(pending)
@@ -116,7 +116,7 @@ def missed(state: LiveSession, trial: int, show: str, reason: str, at: float) ->
 
     Raises `RefusedError` if that trial is not pending.
     """
-    _live(state, trial)
+    _pending_trial(state, trial)
     return _event(state, "missed", at, id=trial, show=show, reason=reason)
 
 
@@ -341,7 +341,7 @@ def _running(state: LiveSession) -> None:
         raise RefusedError("over", "the session has ended.")
 
 
-def _live(state: LiveSession, id: int) -> Trial:
+def _pending_trial(state: LiveSession, id: int) -> Trial:
     """Return the trial with this id. Raises RefusedError if it does not exist or is not pending."""
     trial = state.trial(id)
     if trial.status != "pending":

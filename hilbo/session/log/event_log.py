@@ -114,7 +114,7 @@ class EventLog:
             content = _content(file)
             header, events, lines, dropped = read_lines(content, path)
             state = _folded(path, study, header, events)
-            _end(file, path, content, sum(map(len, lines)))
+            _repair_end(file, path, content, sum(map(len, lines)))
         except BaseException:
             os.close(file)
             raise
@@ -234,7 +234,7 @@ def read_session(
     return _folded(path, study, header, events)
 
 
-def _end(file: int, path: str | os.PathLike, content: bytes, size: int) -> None:
+def _repair_end(file: int, path: str | os.PathLike, content: bytes, size: int) -> None:
     """Make an open log end with its last complete line. `content`: bytes of the file; `size`: bytes of its complete
     lines, with their newlines. Cuts off what follows, or adds the missing newline. Raises InputError if that fails."""
     if size == len(content):

@@ -161,8 +161,8 @@ def _header_of_row(row: PlanRow) -> Header:
 def _header(study, person, session, seed, phase, materials, sets, source, codes) -> Header:
     """Header of one participant's session: of optimisation, or of comparisons with the codes in the names of sets.
 
-    Arguments as in `make_plan`; `materials` in this participant's order, `codes`: participant -> code. Raises
-    InputError if the phase needs sets and lacks them.
+    `materials` are in this participant's order; `sets`: material -> name -> parameters, or None; `codes`: participant
+    -> code. Raises InputError if the phase needs sets and lacks them.
     """
     if phase == "optimisation":
         return header_for(study, person, session, seed, materials=materials)

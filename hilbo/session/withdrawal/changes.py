@@ -84,8 +84,8 @@ def read_table(path: Path) -> Cells | None:
 
 
 def table_content(path: Path, edited: Edited) -> bytes:
-    """Content of the file `path` with only the rows that stay; numbers in Parquet stay the same bits (the file is read
-    again)."""
+    """Content of the file `path` after the edit: only rows that stay, with new names of sets. A Parquet file is read
+    again for it, so that its numbers stay the same bits."""
     if path.suffix == ".parquet":
         import pandas as pd
 
@@ -166,8 +166,9 @@ def _new_cell(cell: str, column: str, names: Mapping[str, str]) -> str:
 
 
 def plan_without(content: bytes, participant: str, label: str) -> str | None:
-    """Text of a plan with `label` in place of a participant, a new hash, and the old one in `replaces`. With individual
-    sets the participant's row is removed. None if the content is no plan, or has nothing of theirs."""
+    """Text of a plan with `label` in place of a participant, the old hash in `replaces`, and a new one (unless the old
+    did not fit). With individual sets the participant's row is removed. None if the content is no plan, or has nothing
+    of theirs."""
     plan = plan_in(content)
     if plan is None or not any(participant in (row.participant, row.reissued_from) for row in plan.participants):
         return None

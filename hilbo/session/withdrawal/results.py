@@ -42,7 +42,7 @@ def computed(folder: Path, participant: str, files: Iterable[Path]) -> list[Path
     computed = [path for name, path in ours if not _is_data(name, _EXPORT in results.files)]
     may_hold = not results.command or " validate " in f"{results.command} "
     named = command_without(results.command, participant) != results.command
-    if computed and (may_hold or named or any(_names(path, participant) for _, path in ours)):
+    if computed and (may_hold or named or any(_names_participant(path, participant) for _, path in ours)):
         return computed
     return []
 
@@ -53,7 +53,7 @@ def _is_data(name: str, exported: bool) -> bool:
     return not name.endswith(".nc") if exported else _DATA.fullmatch(name.rpartition("/")[2]) is not None
 
 
-def _names(path: Path, participant: str) -> bool:
+def _names_participant(path: Path, participant: str) -> bool:
     """Whether a text file of results names the participant, by exactly this id; True if it cannot be read."""
     try:
         return path.suffix in _TEXTS and bool(spelled(read_text(path), path.suffix, participant, exact=True))

@@ -102,12 +102,12 @@ def same_id(text: str, participant: str) -> bool:
 
 
 def _form(text: str) -> str:
-    """Normal form of an id for `same_id`: without blanks and leading zeros, lower case, NFKC."""
+    """Normal form of an id for `same_id`: without blanks, leading zeros and ".0" after numbers; lower case, NFKC."""
     text = re.sub(r"\s+", "", unicodedata.normalize("NFKC", text)).casefold()
     return re.sub(r"(?<=\d)\.0+(?!\d)", "", re.sub(r"(?<![\d.])0+(?=\d)", "", text))
 
 
-def _way(participant: str, exact: bool) -> str:
+def _id_pattern(participant: str, exact: bool) -> str:
     """Regular expression of an id: of exactly this text, or of all spellings that `same_id` accepts."""
     if exact:
         return re.escape(participant)
@@ -132,7 +132,7 @@ def spelled(text: str, suffix: str, participant: str, exact: bool = False) -> st
     """The first occurrence of a participant's id in a file's text, as it is spelled there (perhaps with the words
     around it); "" if there is none. `suffix`: the file's, which decides where a numeric id is looked for. `exact`: only
     this spelling."""
-    text, way = _PICTURE.sub("", text), _way(participant, exact)
+    text, way = _PICTURE.sub("", text), _id_pattern(participant, exact)
     text = text if exact else unicodedata.normalize("NFKC", text)
     match = re.search(rf"(?:(?<![\w.-])|(?<=\bown-)){way}(?![\w-]|\.\w)", text)
     if match is None:
