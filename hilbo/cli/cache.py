@@ -1,6 +1,7 @@
 """`hilbo cache`: show or delete the compiled functions that are kept from one command to the next."""
 
 import shutil
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -29,6 +30,6 @@ def cache(
     print_result(content, "\n".join([str(folder), *words]), as_json)
 
 
-def _files(folder):
+def _files(folder: Path) -> list[Path]:
     """The files of JAX's compilation cache in a folder; none if there is no such folder."""
     return [path for path in folder.glob("*-cache") if path.is_file()]

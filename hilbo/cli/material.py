@@ -76,7 +76,15 @@ def identify(
     finish(content, out, as_json)
 
 
-def _model(measured, model, weights, taps, period, memory, instrument) -> Any:
+def _model(
+    measured: bool,
+    model: str,
+    weights,
+    taps: int,
+    period: float,
+    memory,
+    instrument: dict[str, Any],
+) -> Any:
     """The model to fit: a sampled FO-SLS for tests with a force (`measured`), else one of moduli. `instrument`: lag
     (ms) and corner (Hz) as given. Raises `InputError` for options of the other kind."""
     from hilbo.identification.moduli import Continuous, FractionalMaxwell
@@ -163,7 +171,7 @@ def _rendered(K0: float | None, K1: float, B1: float, alpha: float, renderer: di
     return sampled(K0)
 
 
-def _renderer(study):
+def _renderer(study: Path | None) -> dict[str, Any]:
     """N, T, memory, K_eff, damping and delay of the [renderer] of a study file, or those of the paper for None. Raises
     `InputError` for a study without one."""
     if study is None:
@@ -176,7 +184,7 @@ def _renderer(study):
     return {name: getattr(mechanics, name) for name in ("N", "T", "memory", "K_eff", "damping", "delay")}
 
 
-def _order(alpha):
+def _order(alpha: float) -> None:
     """Raise `InputError` unless the order alpha is above 0 and at most 1."""
     if not 0 < alpha <= 1:
         raise InputError(f"alpha is {alpha}; it must be above 0 and at most 1: the order of the fractional element.")
@@ -193,7 +201,7 @@ def _number(name: str, text: str, words: tuple[str, ...]) -> float | str:
         raise InputError(f'--{name} is "{text}"; it must be a number or {allowed}.') from None
 
 
-def _positive(name, value):
+def _positive(name: str, value: float | None) -> None:
     """Raise `InputError` unless the option's value is None, or positive and finite."""
     if value is not None and not 0 < value < float("inf"):
         raise InputError(f"--{name} is {value}; it must be a number above 0.")

@@ -4,6 +4,7 @@ Their files are written whole or not at all, and nothing is replaced without `--
 """
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -154,7 +155,8 @@ def delete(
 
 
 def _say_done(done) -> None:
-    """Print on stderr what a withdrawal has removed, renamed and left, and the commands that make results again."""
+    """Print on stderr what a withdrawal (`done`, a `Withdrawal`) has removed, renamed and left, and the commands that
+    make results again."""
     for path, count in done.removed.items():
         typer.echo(f"{path}: {count} removed", err=True)
     for path, count in done.renamed.items():
@@ -165,7 +167,17 @@ def _say_done(done) -> None:
         typer.echo(f"make again: {command}", err=True)
 
 
-def _plan_of(path, kind, source, people, materials, paths, trials, session, seed) -> Any:
+def _plan_of(
+    path: Path,
+    kind,
+    source,
+    people: list[str],
+    materials: tuple[str, ...],
+    paths: dict[str, Path],
+    trials: Path | None,
+    session: str,
+    seed: int,
+) -> Any:
     """A new plan; `paths`: material -> result.json, from which the sets of a validation are made. Prints what a
     device's delay leaves of the search space. Raises `InputError`."""
     start()
@@ -187,7 +199,7 @@ def _plan_of(path, kind, source, people, materials, paths, trials, session, seed
         )
 
 
-def _people(count, names, letter) -> list[str]:
+def _people(count, names: str | None, letter: str) -> list[str]:
     """The ids of the participants: the `names`, separated by commas, or `count` numbers after a letter (P01, P02).
     Raises `InputError` unless exactly one of both is given."""
     if (count is None) == (names is None):
@@ -198,7 +210,7 @@ def _people(count, names, letter) -> list[str]:
     return [f"{letter}{i + 1:0{width}d}" for i in range(count)]
 
 
-def _searchable(path) -> Any:
+def _searchable(path: Path) -> Any:
     """The study file, checked to have parameters that a device can render passively; no model is needed to plan an
     optimisation. Raises `InputError`."""
     from hilbo.search.space import SearchSpace
@@ -223,7 +235,7 @@ def _say_delays(study, materials) -> None:
             remark((f"{name}: " if name else "") + delay_words(SearchSpace(box.parameters, box.mechanics)))
 
 
-def _load_study(path) -> Any:
+def _load_study(path: Path) -> Any:
     """The study of a file, with its model. Raises `InputError`."""
     from hilbo.study.config import Study
 
@@ -258,7 +270,7 @@ def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
     return sets
 
 
-def _by_material(materials, given) -> dict[str, Path]:
+def _by_material(materials: Sequence[str], given: Sequence[str]) -> dict[str, Path]:
     """Material ("" without) -> path, from the texts of --from: one path, or MATERIAL=PATH for each material. Raises
     `InputError` for any other choice."""
     if not given:
@@ -272,9 +284,9 @@ def _by_material(materials, given) -> dict[str, Path]:
     return {name: Path(path) for name, _, path in pairs}
 
 
-def _reissued(path, study_path, study, text, results_):
-    """The plan of a file with the row of one participant given to another, by the text OLD=NEW; nothing is written.
-    Raises `InputError`."""
+def _reissued(path: Path, study_path: Path, study, text: str, results_: list[str]) -> Any:
+    """The plan of the file `path` for the study file `study`, with the row of one participant given to another by the
+    `text` OLD=NEW; nothing is written. Raises `InputError`."""
     from hilbo.session.plan.plan import check_plan, reissue
     from hilbo.study.file.plan_file import read_plan
 
@@ -292,7 +304,7 @@ def _reissued(path, study_path, study, text, results_):
     return changed
 
 
-def _check_not_in_map(path, study_path, materials, results_, new):
+def _check_not_in_map(path: Path, study_path: Path, materials: Sequence[str], results_: list[str], new: str) -> None:
     """Raise `InputError` if the participant `new` contributed to the aggregate that the plan validates, or if no result
     files (`results_`) are given: only these name them."""
     if not results_:
@@ -310,7 +322,7 @@ def _check_not_in_map(path, study_path, materials, results_, new):
         check_participants(result, [new], "aggregate")
 
 
-def _check_register(register, out, reissue, force):
+def _check_register(register: Path, out: Path, reissue: str | None, force: bool) -> None:
     """Raise `InputError` if --register is given with --reissue, names the file of the plan, or a file that may not be
     written."""
     if reissue is not None:
@@ -320,8 +332,8 @@ def _check_register(register, out, reissue, force):
     check_free(register, force)
 
 
-def _write_registration(file, plan, out, force):
-    """Write the page for a pre-registration, and print a remark on it on stderr."""
+def _write_registration(file, plan, out: Path, force: bool) -> None:
+    """Write the page for a pre-registration of a plan of the study `file`, and print a remark on it on stderr."""
     from hilbo import __version__
     from hilbo.report.registration import registration
 
@@ -329,7 +341,7 @@ def _write_registration(file, plan, out, force):
     typer.echo(f"{out}: read it, and fill in what is to be written by you", err=True)
 
 
-def _write_plan(plan, out, force, as_json):
+def _write_plan(plan, out: Path, force: bool, as_json: bool) -> None:
     """Write a plan to a file, and print on stderr whether its orders are balanced; with `as_json` the plan on
     stdout."""
     from hilbo.study.file.plan_file import plan_text

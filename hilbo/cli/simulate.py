@@ -9,7 +9,7 @@ import typer
 
 from hilbo.cli.aggregate import aggregate_cohort
 from hilbo.cli.live import live as hold_session
-from hilbo.cli.terminal.console import Force, Json, Out, Preset, finish, progress, results, seed_option, start
+from hilbo.cli.terminal.console import Force, Json, Out, Preset, Say, finish, progress, results, seed_option, start
 from hilbo.errors import InputError
 
 __all__ = ["simulate"]
@@ -60,7 +60,7 @@ def _check_mode(live: bool, of_a_study: Mapping[str, Any], of_a_session: Mapping
         raise InputError(f"{given[0]} does nothing without --live; add --live, or leave it out.")
 
 
-def _simulate(preset, source, count, seed, folder, say) -> dict[str, Any]:
+def _simulate(preset: str | None, source: Path | None, count: int, seed: int, folder: Path, say: Say) -> dict[str, Any]:
     """Simulate `count` participants of the study file `source` (None: the paper's), write their trials and results to
     `folder`, and return the content of result.json; the error of the optimum is printed."""
     say("simulating")
@@ -78,7 +78,9 @@ def _simulate(preset, source, count, seed, folder, say) -> dict[str, Any]:
     return content
 
 
-def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:
+def _simulate_live(
+    preset: str | None, study: Path | None, out: Path, phase: str, seconds: float | None, seed: int, as_json: bool
+) -> None:
     """Run one session without people into the folder `out`, and print its summary on stdout."""
     from importlib.resources import files
 

@@ -10,6 +10,7 @@ import secrets
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -93,7 +94,7 @@ def study_text(source: Path | None, trials: int | None) -> str:
 
 
 @contextlib.contextmanager
-def _folder(out):
+def _folder(out: Path | None) -> Iterator[Path]:
     """The folder for study and log: `out`, made if it is missing, or a new temporary one, which is deleted at the end
     unless a log in it has an answer. Raises `InputError` if `out` is not empty."""
     if out is not None:

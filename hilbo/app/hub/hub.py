@@ -308,7 +308,7 @@ class Hub:
         """Whether the map is compiled, so that slices are available."""
         return self._maps is not None
 
-    def _check_page(self, page) -> None:
+    def _check_page(self, page: str | None) -> None:
         """Raise `NotNowError` unless the participant's window `page` is the newest; None, a program, always passes."""
         if not self.watchers.counts(page):
             raise NotNowError(self.state.study.session.text("moved"))

@@ -136,7 +136,7 @@ def _resumed(wanted: Wanted, study: StudyFile) -> tuple[EventLog, LiveChooser]:
         raise
 
 
-def _check_asked_for(wanted, header: Header, log: EventLog) -> None:
+def _check_asked_for(wanted: Wanted, header: Header, log: EventLog) -> None:
     """Raise `InputError` if the log belongs to another participant or session, or was begun with another material, seed
     or plan than the options give; `header` is that of a new session with these options. Options that are None pass."""
     begun = log.state.header
@@ -182,7 +182,7 @@ def _header(wanted: Wanted, study: StudyFile) -> Header:
     return _as_asked(wanted, header)
 
 
-def _as_asked(wanted, header: Header) -> Header:
+def _as_asked(wanted: Wanted, header: Header) -> Header:
     """A planned header with the session label of the options, if there is one. Raises `InputError` if the options have
     another seed or material than the plan.
 

@@ -14,6 +14,7 @@ from hilbo.study.file.trial_flags import FLAGS, SAMPLES
 __all__ = ["line", "meant", "place_of", "sentence", "table"]
 
 _QUICK = 0.5  # s
+_Data = Mapping[str, Any]  # of an event
 _SHOWN = {"reference": "the reference", "a": "rendering A", "b": "rendering B", "neutral": "nothing"}
 _WHO = {"stimulus": "The program that presents", "preparer": "The preparer"}
 _DEVICE = {"ready": "is ready", "running": "renders", "stopped": "is at rest", "hold": "holds", "estop": "was stopped"}
@@ -47,13 +48,13 @@ def sentence(state: LiveSession, event: Event) -> str:
     return pause + _SENTENCES[event.kind](state, name, data)
 
 
-def _because(data: Mapping[str, Any]) -> str:
+def _because(data: _Data) -> str:
     """The end of a sentence: ": reason." where the data have a reason, else "."."""
     reason = str(data.get("reason", "")).strip().rstrip(".")
     return f": {reason}." if reason else "."
 
 
-def _proposed(_state, name, data):
+def _proposed(_state: LiveSession, name: str, data: _Data) -> str:
     """Which trial (`name`) comes next, and why: a repetition, planned sets, or how it was chosen."""
     sets = " and ".join(data.get("sets", {}).values())
     if data["repeats"] is not None:
@@ -63,7 +64,7 @@ def _proposed(_state, name, data):
     return f"{name} comes next{why}."
 
 
-def _presented(_state, name, data):
+def _presented(_state: LiveSession, name: str, data: _Data) -> str:
     """Which step of a trial (`name`) begins or ends."""
     shown = _SHOWN[data["show"]]
     if data["show"] == "neutral":
@@ -71,7 +72,7 @@ def _presented(_state, name, data):
     return f"{name}: {shown} {'is presented' if data['on'] else 'ends'}."
 
 
-def _answered(_state, name, data):
+def _answered(_state: LiveSession, name: str, data: _Data) -> str:
     """The answer to a trial (`name`) and its response time; a remark on one that was given too quickly, and the flags
     of the device's samples."""
     values, took = data["values"], data["browser"].get("response_s")
@@ -101,13 +102,13 @@ def _flags(telemetry: Mapping[str, int] | None) -> str:
     return f" Flagged of {telemetry[SAMPLES]} samples: {words}."
 
 
-def _repeated(trial, name, seq):
+def _repeated(trial: Trial, name: str, seq: int) -> str:
     """Whether a trial will be repeated later (if it was answered before event number `seq`) or begins again now."""
     answered = trial.answered is not None and trial.answered["seq"] < seq
     return f"{name} will be asked once more, later." if answered else f"{name} begins again from its first step."
 
 
-def _device(state, name, data):
+def _device(state: LiveSession, name: str, data: _Data) -> str:
     """The new condition of the device, program or preparer, with its reason, and whether it made the trial (`name`)
     void."""
     stimulus = state.study.stimulus
@@ -121,7 +122,7 @@ def _device(state, name, data):
     return f"{words} {name} is void." if voided and voided["by"] == "rule" else words
 
 
-_SENTENCES: dict[str, Callable[[LiveSession, str, Mapping[str, Any]], str]] = {
+_SENTENCES: dict[str, Callable[[LiveSession, str, _Data], str]] = {
     "propose": _proposed,
     "sent": lambda _, name, data: f"{name}: {_SHOWN[data['side']]} is in force.",
     "stimulus": _presented,

@@ -70,7 +70,7 @@ class Decider:
         key = jax.random.fold_in(self._key, self._count)
         return self._study.responses[int(self._answer(key, jnp.asarray(unit[ask[-1]])))]
 
-    def _distance(self, x):
+    def _distance(self, x: np.ndarray) -> float:
         """Distance of a point `x` (d,) of the unit cube from the participant's optimum, in tolerances."""
         away = simulate.felt_apart(self._person.levels, x, np.asarray(self._person.optimum))
         return float(np.linalg.norm(away / np.asarray(self._person.tolerance)))
@@ -190,7 +190,7 @@ def rehearse(
 
 
 @contextlib.contextmanager
-def _by_device(arguments, decide):
+def _by_device(arguments: list[str], decide: Decider):
     """Run the server with a simulated device; yields its links, `decide`, and a function that makes from `watch`
     (returns the experimenter's view) what has the finger press (`_presser`)."""
     finger = Simulator(finger="rest")
@@ -226,8 +226,9 @@ def _plan(study, material, sets, phase, seed) -> Plan:
 
 
 def _session(program, links, decide, touches, out, say) -> dict[str, Any]:
-    """Open both pages, act as the participant until the session ends, and return the first part of the summary of
-    `rehearse`; screenshots go to `out`/screens."""
+    """Open both pages in the browser `program`, act as the participant until the session ends, and return the first
+    part of the summary of `rehearse`; screenshots go to `out`/screens. `links`: role -> link; `decide`, `touches`: as
+    `_by_device` yields them."""
     screens = out / "screens"
     screens.mkdir(exist_ok=True)
     desk = dict(zip(("width", "height"), SIZES[0], strict=True))
@@ -259,7 +260,7 @@ def _session(program, links, decide, touches, out, say) -> dict[str, Any]:
     }
 
 
-def _lead(participant, window, experimenter, screens, say) -> int:
+def _lead(participant: Participant, window, experimenter, screens: Path, say: Callable[[str], Any]) -> int:
     """Act as the participant until the session ends, with a screenshot of each new phase and at some numbers of
     answers; returns how many HOLDs were cleared."""
     taken: set[tuple[str, str]] = set()
@@ -279,7 +280,7 @@ def _lead(participant, window, experimenter, screens, say) -> int:
         time.sleep(0.02)
 
 
-def _picture_participant(window, screens, taken) -> None:
+def _picture_participant(window, screens: Path, taken: set[tuple[str, str]]) -> None:
     """Take a screenshot of the participant's page if its phase and question are not among `taken` yet, at most
     `_PICTURES`."""
     seen = "[document.body.dataset.phase, document.querySelector('#options button') ? at('title').textContent : '']"
@@ -292,7 +293,7 @@ def _picture_participant(window, screens, taken) -> None:
             screenshots(window, screens, f"participant-{len(taken)}-{phase}{'-question' if question else ''}")
 
 
-def _picture_experimenter(experimenter, participant, screens, name) -> None:
+def _picture_experimenter(experimenter, participant: Participant, screens: Path, name: str) -> None:
     """Take a screenshot of the experimenter's page, once it shows all answers or after `_PATIENCE` s."""
     end = time.monotonic() + _PATIENCE  # of a page that hears nothing there is a picture too
     while not experimenter.evaluate(_HEARD, participant.answered) and time.monotonic() < end:
@@ -312,8 +313,8 @@ def _clear_hold(experimenter) -> bool:
 
 
 def _presser(finger, watch) -> Callable[[bool], None]:
-    """A function that has the simulated finger press from its first call with True on, and leave the handle at the next
-    call with False."""
+    """A function `feel(on)` that has the simulated finger press from its first call with True on, and leave the handle
+    at the next call with False. `watch`: returns the experimenter's view."""
     pressing = False
 
     def feel(on):
