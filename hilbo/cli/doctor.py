@@ -77,7 +77,7 @@ def checks(
 
 
 def _versions() -> Check:
-    """Versions of Python and packages; bad if one for live sessions is missing."""
+    """Versions of Python and packages: bad if one for live sessions is missing, a note if another is."""
     versions, missing = [f"Python {platform.python_version()}"], []
     for package in _PARTS:
         try:
@@ -249,7 +249,8 @@ def _device(connect: Callable[[float | None, float | None], Any], file: Any) -> 
 
 
 def _language(file: Any) -> Iterator[Check]:
-    """A note if some texts are not translated, or not reviewed by a native speaker; nothing for English."""
+    """Whether the participants' texts are translated, and reviewed by a native speaker: a note if not; nothing for
+    English."""
     from hilbo.study.file.languages import LANGUAGES, language
 
     session = file.session

@@ -104,9 +104,9 @@ def example_sets(study: Study, population: Population) -> dict[str, dict[str, fl
 
 @contextlib.contextmanager
 def server(*arguments: str, patience: float = 600.0) -> Iterator[tuple[subprocess.Popen, dict[str, str]]]:
-    """Run `hilbo session` with these arguments in a process, and yield the process and its links; terminate it at the
-    end, and kill it after 30 s. Raises `RuntimeError` with the end of its stderr if it does not start; it has
-    `patience` s to end then."""
+    """Run `hilbo session` with these arguments in a process, and yield the process and its links (role -> link, and log
+    and device); terminate it at the end, and kill it after 30 s. Raises `RuntimeError` with the end of its stderr if it
+    does not start; then it may take `patience` s to end."""
     process = subprocess.Popen(
         [*HILBO, "session", *arguments, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -23,7 +23,8 @@ _AGAIN = 0.1  # s until a server that did not take a report is asked again
 
 
 class StandIn:
-    """Joins by the link of `role`, and confirms orders in a thread of its own until `close`."""
+    """Joins by the link of `role`, and confirms orders in a thread of its own until `close`, which the end of a with
+    block calls."""
 
     def __init__(self, study: StudyFile, link: str, role: Role):
         self._study, self._client, self._path = study, Client(link), f"/api/{role}"
