@@ -86,7 +86,8 @@ class Runner:
 
     async def _run(self, stop: asyncio.Event) -> None:
         """Work until only an event from outside can change the state. A missed step voids its trial, a hand that stays
-        interrupts the trial, any other error becomes `trouble`; then the task restarts itself, unless `stop` is set."""
+        interrupts the trial, an event that is refused has no consequence, any other error becomes `trouble`; then the
+        task restarts itself, unless `stop` is set."""
         try:
             try:
                 await self._lead()

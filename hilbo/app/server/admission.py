@@ -49,7 +49,8 @@ class Listener:
             self._close_connection(line)
 
     def _accept(self) -> None:
-        """Accept the waiting connections, at most `_AT_ONCE`; each is inspected, or watched until it sends data."""
+        """Accept the waiting connections, at most `_AT_ONCE`; each is inspected, or watched until it sends data. The
+        oldest pending one is closed if there are too many, or no file is left."""
         for _ in range(_AT_ONCE):
             try:
                 line, _ = self._listening.accept()

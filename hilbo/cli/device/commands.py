@@ -150,7 +150,10 @@ def record(
     force: ForceFile = False,
     as_json: JsonToo = False,
 ) -> None:
-    """Write telemetry to a CSV file: tick, time_s, position_mm, force_N, sensed_N, flags. Ctrl-C ends it earlier."""
+    """Write telemetry to a CSV file: tick, time_s, position_mm, force_N, sensed_N, flags. Ctrl-C ends it earlier.
+
+    If the device or the line fails, the file has the samples until then, and the exit code is 1.
+    """
     from hilbo.device.failures import DeviceError
 
     check_free(out, force)
