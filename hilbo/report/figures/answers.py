@@ -1,6 +1,7 @@
-"""Marks of answers on maps: one of its own for each answer, and a disc of shares where a place got several.
+"""Marks of responses on maps: one shape for each response, and a pie marker of response proportions where several
+responses were given at one point.
 
-Marks at one place would cover each other, and the category that is drawn last would hide all others.
+Marks at one point would cover each other, and the category that is drawn last would hide all others.
 """
 
 from typing import Any
@@ -23,8 +24,11 @@ _CORNERS = 60  # of a whole disc
 
 
 def mark_trials(axes, study: Study, cohort: Cohort, third: float | None) -> Int[np.ndarray, " p"]:
-    """Tested stimuli near a slice, each with the mark of its answer, or with the shares of several; how many answers
-    each place has."""
+    """Draw the responses near a slice on `axes`: one mark for each, or a pie marker for several at one point.
+
+    `third`: value of the third parameter on the slice (unit cube), of which trials within 0.08 are drawn; None: all.
+    Returns the number of responses at each point drawn, (p,).
+    """
     x, q = _answers(cohort)
     near = np.ones(len(x), bool) if third is None else np.abs(x[:, 2] - third) < _NEAR
     points = np.asarray(study.space.to_physical(x))[near, :2]
@@ -42,8 +46,9 @@ def mark_trials(axes, study: Study, cohort: Cohort, third: float | None) -> Int[
 
 
 def mark_along(axes, study: Study, cohort: Cohort) -> Int[np.ndarray, " p"]:
-    """Answers beside a map of one parameter: a row of marks for each category, larger where the same answer was given
-    more often; how many answers each mark stands for."""
+    """Draw the responses at the bottom of `axes` of a map of one parameter: a row of marks for each category, larger
+    where the same response was given more often. Returns the number of responses of each mark, (p,).
+    """
     x, q = _answers(cohort)
     points, places = np.asarray(study.space.to_physical(x))[:, 0], axes.get_xaxis_transform()
     marks = [np.unique(points[q == category], return_counts=True) for category in range(len(study.responses))]
@@ -57,9 +62,11 @@ def mark_along(axes, study: Study, cohort: Cohort) -> Int[np.ndarray, " p"]:
 
 
 def answer_handles(study: Study, counts: Int[np.ndarray, " p"], *, discs: bool = True) -> list[Any]:
-    """What a legend shows of the answers, lowest first, and what discs, or larger marks, stand for.
+    """Legend handles for the responses, lowest first, and one for pie markers (`discs`) or larger marks if there are
+    any.
 
-    `counts`: how many answers each place has, as `mark_trials` and `mark_along` return.
+    `counts` (p,): numbers of responses, as `mark_trials` and `mark_along` return. Where all points are pie markers,
+    every handle is a circle.
     """
     several = counts[counts > 1]
     no_marks = discs and 0 < len(several) == len(counts)
@@ -80,30 +87,35 @@ def answer_handles(study: Study, counts: Int[np.ndarray, " p"], *, discs: bool =
 
 
 def _answers(cohort: Cohort) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
-    """Points of the unit cube and categories of all answers."""
+    """Points (n, d) of the unit cube and categories (n,) of all responses of all participants."""
     mask = np.asarray(cohort.trials.mask)
     return np.asarray(cohort.trials.x)[mask], np.asarray(cohort.trials.q)[mask]
 
 
 def _look(study: Study, category: int) -> dict[str, Any]:
-    """Marker of an answer: a shape of its own, filled the more the higher the answer is; the highest is a circle."""
+    """Keyword arguments of `scatter` for a category: a shape of its own, the darker the higher the category; the
+    highest is a circle.
+    """
     top = category == len(study.responses) - 1
     look: dict[str, Any] = {"marker": "o" if top else _SHAPES[category % len(_SHAPES)], "s": 15 if top else 9}
     return look | {"facecolor": _fill(study, category), "edgecolor": "black", "linewidth": 0.5}
 
 
 def _fill(study: Study, category: int) -> tuple[float, ...]:
+    """Colour (red, green, blue) of a category: from white for the lowest to orange for the highest."""
     share = category / (len(study.responses) - 1)
     return tuple(1 - share * (1 - part) for part in to_rgb(ORANGE))
 
 
 def _area(count: Any, most: int) -> Any:
-    """Points² of a disc of several answers: it grows evenly with their number."""
+    """Area (points²) of the pie marker of `count` responses; it grows linearly up to that of `most` responses."""
     return _FEW + (_MANY - _FEW) * (count - 2) / max(most - 2, 1)
 
 
 def _disc(axes, study: Study, point: Float[np.ndarray, " 2"], tally: Int[np.ndarray, " C"], area: float) -> None:
-    """The shares of several answers at one place, lowest first, clockwise from the top."""
+    """Draw a pie marker of the response counts `tally` at a `point` in physical units on `axes`, lowest category first,
+    clockwise from the top. `area`: in points².
+    """
     ends = 2 * np.pi * np.cumsum([0, *tally]) / tally.sum()
     for category in np.flatnonzero(tally).tolist():
         turns = np.linspace(ends[category], ends[category + 1], 2 + int(_CORNERS * tally[category] / tally.sum()))
@@ -119,5 +131,6 @@ def _disc(axes, study: Study, point: Float[np.ndarray, " 2"], tally: Int[np.ndar
 
 
 def _handle(label: str, **look: Any) -> Line2D:
+    """A legend handle without a line; `look`: further properties of the marker."""
     edge = {"markeredgecolor": "black", "markeredgewidth": 0.5, "markersize": 4.5}
     return Line2D([], [], linestyle="", label=label, **edge | look)

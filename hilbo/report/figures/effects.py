@@ -1,4 +1,4 @@
-"""The figure of what each parameter does: a panel for each, where a map of two or three parameters cannot show all."""
+"""Figure of the effect of each parameter: a panel for each, where a map of two or three parameters cannot show all."""
 
 from collections.abc import Sequence
 
@@ -36,7 +36,9 @@ def effects_figure(study: Study, effects: Sequence[Effect], optimum: Float[np.nd
 
 
 def _draw(axes, effect: Effect, steps: bool, best: float) -> None:
-    """One panel: lines for a continuous parameter, points with bars for steps."""
+    """Draw one panel on `axes`: lines for a continuous parameter, points with bars for a discrete one (`steps`); and a
+    vertical line at the optimum's value `best`.
+    """
     slice_words, average_words = "through the optimum, ± sd", "on average (main effect)"
     if steps:
         bars = {"fmt": "o", "color": BLUE, "markersize": 4, "linewidth": 1}

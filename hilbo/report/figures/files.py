@@ -12,7 +12,10 @@ _UNDATED = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}  # the same fi
 
 
 def write_figure(figure: Figure, folder: Path, name: str) -> bytes:
-    """Write NAME.png, NAME.svg and NAME.pdf, with letters that stay text in the PDF; returns the PNG."""
+    """Write NAME.png, NAME.svg and NAME.pdf into an existing folder, over earlier ones; return the PNG as bytes.
+
+    Text stays text in the PDF, and equal figures give equal files. The figure's layout is fixed by the call.
+    """
     _place(figure)
     for kind, metadata in _UNDATED.items():
         with mpl.rc_context({"pdf.fonttype": 42, "svg.hashsalt": name}):
@@ -24,7 +27,9 @@ def write_figure(figure: Figure, folder: Path, name: str) -> bytes:
 
 
 def _place(figure: Figure) -> None:
-    """Find everything's place in a figure, once for all its files: more than half of what drawing costs."""
+    """Compute the layout of a figure once for all its files, which takes more than half of the time of drawing, and
+    switch its layout engine off.
+    """
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)

@@ -76,11 +76,11 @@ class Slice(NamedTuple):
 
 
 def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
-    """Slices of the population map's mean through the optimum, the non-passive part white, near trials marked.
+    """Slices of the population map's mean through the optimum, with trials near them; infeasible points are white.
 
     The first two parameters span the slices; there is one at the optimum's value of the third, and one on either side.
     Further parameters stay at the optimum. With one parameter, the map is a curve with its standard deviation.
-    `surface`: the map's mean and variance at points (m, d) of the unit cube.
+    `surface`: the map's mean and variance at points (m, d) of the unit cube; `optimum` (d,): in the unit cube.
     """
     if study.space.dim == 1:
         return _map_curve(study, surface, optimum, cohort)
@@ -100,13 +100,18 @@ def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"],
 
 
 def slices_after(study: Study, progress: Progress) -> Figure:
-    """The population map after the first trials of everybody, each at its own optimum (the star)."""
+    """Population maps after the first few numbers of trials side by side, each sliced through its own optimum (the
+    star).
+    """
     maps = {f"{count} trials": partial(predict_map, map_) for count, map_ in progress.maps.items()}
     return maps_beside(study, maps, progress.population[progress.at(progress.moments)])
 
 
 def maps_beside(study: Study, maps: Mapping[str, Surface], optima: Float[np.ndarray, "k d"]) -> Figure:
-    """Named population maps side by side, each sliced through its own optimum (the star), on one colour scale."""
+    """Named population maps side by side, each sliced through its own optimum (the star), on one colour scale.
+
+    `optima` (k, d): in the unit cube, in the order of the maps. With one parameter the means are curves on one panel.
+    """
     if study.space.dim == 1:
         return _curves_beside(study, maps, optima)
     thirds = [float(x[2]) if study.space.dim > 2 else None for x in optima]
@@ -123,7 +128,10 @@ def maps_beside(study: Study, maps: Mapping[str, Surface], optima: Float[np.ndar
 
 @styled
 def moved_optima(names: Sequence[str], moves: Float[ArrayLike, " M"], population_move: float, limit: float) -> Figure:
-    """How far everybody's own optimum moved (dots, in order) and the population's (line), in % of the search ranges."""
+    """NRMSE between each participant's two optima (dots, sorted) and between the population's (line), in per cent.
+
+    `moves` (M,), `population_move` and `limit`, from which a shift is flagged: NRMSE, fractions of the search ranges.
+    """
     percent = 100 * np.asarray(moves)
     order, rows = np.argsort(percent), np.arange(len(percent))
     figure, axes = new_figure(ONE_COLUMN, 1.2 + 0.14 * len(percent))
@@ -138,7 +146,9 @@ def moved_optima(names: Sequence[str], moves: Float[ArrayLike, " M"], population
 
 @styled
 def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[str, Float[np.ndarray, " d"]]) -> Figure:
-    """Everybody's own optimum, pair by pair of parameters, with named points (the population optimum, ...)."""
+    """Individual optima (M, d), pair by pair of the first three parameters, with named points `marks`, such as the
+    population optimum; all in the unit cube.
+    """
     d = study.space.dim
     pairs = [(0, 1), (0, 2), (1, 2)] if d > 2 else [(0, d - 1)]
     physical = np.asarray(study.space.to_physical(optima))
@@ -156,8 +166,12 @@ def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[s
 
 
 def _levels(parameter, third):
-    """The optimum's value of the third parameter and one on either side, as far as the unit cube goes; of levels all,
-    up to three."""
+    """Three values of the third parameter in the unit cube, sorted: the optimum's (`third`) and one on either side,
+    within the cube.
+
+    For a categorical parameter up to three of its levels; for other discrete ones the distinct steps, which may be
+    fewer.
+    """
     if parameter.levels:
         others = [x for x in parameter.axis(parameter.steps).tolist() if abs(x - third) > 1e-9]
         return sorted((third, *others[:2]))
@@ -174,7 +188,11 @@ def _levels(parameter, third):
 
 @styled
 def map_panels(study: Study, grids):
-    """A figure with a panel for each grid, and what draws a grid on one, all on one colour scale."""
+    """A figure with a panel for each grid, its list of panels (axes), and a function (axes, grid) that draws a grid on
+    one.
+
+    `grids`: of `grid_slice`; all have one colour scale. Contours are drawn only between numeric parameters.
+    """
     heights = np.concatenate([g.mean.ravel() for g in grids])
     low, high = np.nanmin(heights), np.nanmax(heights)
     size = (ONE_COLUMN, 2.9) if len(grids) == 1 else (TWO_COLUMNS, 2.6)
@@ -203,12 +221,12 @@ def map_panels(study: Study, grids):
 
 
 def _has_lines(study: Study) -> bool:
-    """Whether a map has contours: between levels there is nothing."""
+    """Whether a map has contours: not if one of the first two parameters is categorical."""
     return not any(p.levels for p in study.space.parameters[:2])
 
 
 def map_handles(study: Study) -> list[Any]:
-    """What a legend shows of a map's lines."""
+    """Legend handles for a map's contours: mean and standard deviation; an empty list if it has none."""
     if not _has_lines(study):
         return []
     white = Line2D([], [], color="#bbbbbb", linewidth=0.8, label="mean")
@@ -224,12 +242,14 @@ class Plane(NamedTuple):
     feasible: Bool[np.ndarray, "r c"]
 
     def image(self, values: ArrayLike) -> Float[np.ndarray, "r c"]:
-        """Values of the points (r * c,) on the grid, NaN where a point is not feasible."""
+        """Values (r * c,) of the points as a grid (r, c), NaN where a point is not feasible."""
         return np.where(self.feasible, np.asarray(values).reshape(self.feasible.shape), np.nan)
 
 
 def plane(study: Study, point: Float[ArrayLike, " d"], pair: tuple[int, int] = (0, 1), cells: int = _CELLS) -> Plane:
-    """The grid over a pair of parameters on which the others are as in `point` (d,) of the unit cube."""
+    """Grid of `cells` values of each of two parameters (fewer for discrete ones), with the others as in `point` (d,) of
+    the unit cube. `pair`: indices of the parameters across and up.
+    """
     searched = [study.space.parameters[k] for k in pair]
     axes = [p.axis(cells) for p in searched]
     grid = np.tile(np.asarray(point, float), (len(axes[1]), len(axes[0]), 1))
@@ -240,7 +260,11 @@ def plane(study: Study, point: Float[ArrayLike, " d"], pair: tuple[int, int] = (
 
 
 def grid_slice(study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], third: float | None) -> Slice:
-    """A map over the first two parameters, at `third` of the third; `optimum` (d,): where the others stay."""
+    """Mean and standard deviation of a map over the first two parameters, NaN where not feasible.
+
+    `optimum` (d,) of the unit cube: where the other parameters are; `third`: value of the third parameter instead, or
+    None. `surface`: points (m, d) -> mean and variance (m,).
+    """
     point = np.array(optimum, float)
     if third is not None:
         point[2] = third
@@ -250,20 +274,24 @@ def grid_slice(study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], 
 
 
 def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Physical values, mean and standard deviation of a map of one parameter."""
+    """Physical values, mean and standard deviation of a map of one parameter, (m,) each."""
     side = np.asarray(study.space.parameters[0].axis(_CELLS))
     mean, variance = surface(to_device(side[:, None]))
     return np.asarray(study.space.parameters[0].to_physical(side)), np.asarray(mean), np.sqrt(np.asarray(variance))
 
 
 def label_curve(axes, study: Study) -> None:
-    """Axes of a map of one parameter."""
+    """Label `axes` for a map of one parameter: its values across, the latent score up."""
     label_axes(axes, study, 0, 0)
     axes.set(yscale="linear", ylabel=score_label(study))
 
 
 def draw_curve(axes, study: Study, curve: Sequence[np.ndarray], sd_label: str = "", label: str = "") -> None:
-    """A map of one parameter with its standard deviation: physical values, mean, and standard deviation (m,)."""
+    """Draw a map of one parameter with a band of its standard deviation on `axes`, and label them.
+
+    `curve`: physical values, mean, and standard deviation, (m,) each; `sd_label`, `label`: legend texts of band and
+    line.
+    """
     physical, mean, sd = curve
     label_curve(axes, study)
     axes.fill_between(physical, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0, label=sd_label)
@@ -273,6 +301,7 @@ def draw_curve(axes, study: Study, curve: Sequence[np.ndarray], sd_label: str = 
 
 @styled
 def _map_curve(study, surface, optimum, cohort):
+    """Figure of `map_slices` for one parameter: the map's curve, the responses, and a line at the optimum."""
     figure, axes = new_figure(ONE_COLUMN, 2.5)
     draw_curve(axes, study, _curve(study, surface), "± standard deviation", "population map")
     counts = mark_along(axes, study, cohort)
@@ -284,6 +313,7 @@ def _map_curve(study, surface, optimum, cohort):
 
 @styled
 def _curves_beside(study, maps, optima):
+    """Figure of `maps_beside` for one parameter: at most four maps' means on one panel, each with its optimum."""
     figure, axes = new_figure(ONE_COLUMN, 2.5)
     label_curve(axes, study)
     for (name, surface), x, colour in zip(maps.items(), optima, (ORANGE, GREEN, BLUE, RED), strict=False):

@@ -30,14 +30,20 @@ _LINES = ((ORANGE, "-."), (GREEN, "--"), (RED, ":"), ("#CC79A7", "--"), ("black"
 
 
 def predicted(fitted: Fit, kind: str) -> np.ndarray:
-    """The fit's curve of one kind of test, at its times."""
+    """Curve of a fit for one kind of test, at the times of that test, (m,). Raises `ValueError` for a kind that was not
+    fitted.
+    """
     place = [c.kind for c in fitted.curves].index(kind)
     return np.asarray(fitted.model.predict(fitted.q, fitted.curves[place], fitted.weights[place]))
 
 
 @styled
 def curves_figure(tests: Sequence[Test], result: Characterisation, unit: str = "N/mm") -> Figure:
-    """Above: mean and ± sd of the repeats, the fit, and fits with other memories; below: what each leaves over."""
+    """For each test, above: mean and ± sd of the repeats, the fit, and fits with other memories; below: their
+    residuals.
+
+    `unit`: of moduli.
+    """
     others = [row for row in result.rows if row.N in _OTHERS and getattr(result.fit.model, "N", None) != row.N]
     lines = [
         (row.fit, colour, dash, 0.9, "full memory" if row.N is None else f"N = {row.N}")
@@ -66,6 +72,7 @@ def curves_figure(tests: Sequence[Test], result: Characterisation, unit: str = "
 
 
 def _measured(axes, test):
+    """Draw the mean of a test's repeats on `axes`, with a band of ± sd if there are several."""
     mean = test.output.mean(axis=0)
     if test.repeats > 1:
         sd = test.output.std(axis=0, ddof=1)
@@ -77,6 +84,7 @@ def _measured(axes, test):
 
 
 def _fit_name(fit):
+    """Legend text of a fit: "fit" with its memory, "full memory" or "N = ...", if the model has one."""
     model = fit.model
     if getattr(model, "memory", None) == "short":
         return f"fit, N = {int(model.N)}"
@@ -85,7 +93,7 @@ def _fit_name(fit):
 
 @styled
 def memory_figure(rows: Sequence[Row]) -> Figure:
-    """Error of the best fit against the number of taps, test by test; full memory as a level line."""
+    """NRMSE of the best fit against the number of taps, for relaxation and creep; full memory as a level line."""
     figure, axes = new_figure(6.0, 2.9)
     taps = [(row.N, row.nrmse) for row in rows if row.N is not None]
     for (kind, colour), marker in zip((("relaxation", BLUE), ("creep", ORANGE)), "os", strict=True):
@@ -108,7 +116,9 @@ def memory_figure(rows: Sequence[Row]) -> Figure:
 
 
 def _needed(model: FOSLS, delay: float):
-    """Frequencies (Hz), the damping they ask for (N·s/m), and the curve whose real part that is."""
+    """Frequencies (Hz), and a complex curve (N·s/m) whose real part is the damping needed at each, with the force
+    `delay` (s) late.
+    """
     omega = np.geomspace(2 * np.pi * 0.5, np.pi / model.T, 600)
     response = np.asarray(model.frequency_response(jnp.asarray(omega)))
     cotangent = np.tan((np.pi - omega * model.T) / 2)
@@ -120,9 +130,11 @@ def _needed(model: FOSLS, delay: float):
 
 @styled
 def passivity_figure(model: FOSLS, b: float, delay: float = 0.0) -> Figure:
-    """Left: Nyquist-type plot of (T/2)(1 + j cot(ωT/2))·H, which must stay left of b. Right: its real part over f.
+    """Left: the curve (T/2)(1 + j cot(ωT/2))·H in the complex plane, which must stay left of `b` (N·s/m). Right: its
+    real part, the damping needed, over frequency.
 
-    With a `delay` (s) the real part is the damping that is needed then."""
+    With a `delay` (s) the real part is the damping needed with that delay.
+    """
     frequency, curve = _needed(model, delay)
     worst = int(np.argmax(curve.real))
     margin, most = b - curve.real[worst], max(b, curve.real[worst])
@@ -154,8 +166,10 @@ def passivity_figure(model: FOSLS, b: float, delay: float = 0.0) -> Figure:
 
 @styled
 def passive_set_figure(model: FOSLS, b: float, K_eff: float, delay: float = 0.0) -> Figure:
-    """Largest passive K1 over (B1, α) of the paper's box, and slices of the passive set through it; odd N or full.
-    `delay` of the force in s."""
+    """Left: largest passive K1 over B1 and α in the paper's box; right: the same over B1 at four values of α.
+
+    `b`: device's damping, N·s/m; `K_eff`: static stiffness, N/mm; `delay`: of the force, s. For odd N and full memory.
+    """
     B1, alpha = np.geomspace(0.1, 32, 121), np.linspace(0.01, 0.99, 121)
     limit = np.asarray(_largest(model, B1[None, :], alpha[:, None], b, K_eff, delay))
     this_set = float(model.B1), float(model.alpha), float(model.K1)
@@ -184,12 +198,13 @@ def passive_set_figure(model: FOSLS, b: float, K_eff: float, delay: float = 0.0)
 
 
 def _largest(model, B1, alpha, b, K_eff, delay):
+    """`passivity.largest_K1` (N/mm) with the memory and T of a model; `B1` and `alpha` broadcast."""
     return passivity.largest_K1(B1, alpha, b, K_eff, model.N, model.T, memory=model.memory, delay=delay)
 
 
 @styled
 def bode_figure(model: FOSLS) -> Figure:
-    """Magnitude and phase of the rendering, beside the continuous model with the same parameters (which may differ)."""
+    """Magnitude and phase of the rendering, and of the continuous model with the same parameters, over frequency."""
     omega = np.geomspace(2 * np.pi * 0.05, np.pi / model.T, 400)
     frequency = omega / (2 * np.pi)
     memory = "full memory" if model.memory == "full" else f"N = {model.N}"

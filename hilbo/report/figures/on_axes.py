@@ -1,4 +1,4 @@
-"""A map on axes of yours: for notebooks, and figures of several panels.
+"""A map on given axes: for notebooks, and figures of several panels.
 
 figure, axes = pyplot.subplots(1, 2)
 draw_map(study, posterior, ax=axes[0])
@@ -29,16 +29,16 @@ _CELLS = 61
 def draw_map(
     study: Study, model: Posterior | Aggregate, pair: tuple[str, str] | None = None, *, ax: Axes | None = None
 ) -> Axes:
-    """The mean of one participant's posterior, or of the population map, over two parameters through its maximum.
+    """Draw the mean of one participant's posterior, or of the population map, over two parameters through its maximum.
 
     **Arguments:**
 
-    - `pair`: names of the parameters across and up; the first two without it. Of a study with one parameter the mean
-      is drawn as a curve with its standard deviation.
+    - `pair`: names of the parameters across and up; the first two without it. Of a study with one parameter the mean is
+      drawn as a curve with its standard deviation.
     - `ax`: the axes to draw on; without it those of a new figure of pyplot, which notebooks show.
 
-    **Returns:** the axes. Infeasible renderings are left white, the maximum is a star; the others are named in the
-    title. Raises `InputError` for parameters that the study does not have.
+    **Returns:** the axes. Infeasible stimuli are left white, the maximum is a star; the values of the other parameters
+    are in the title. Raises `InputError` for parameters that the study does not have, and for a model of another type.
     """
     names = study.space.names
     axes = _new_axes() if ax is None else ax
@@ -59,13 +59,16 @@ def draw_map(
 
 
 def _new_axes() -> Axes:
+    """Axes of a new pyplot figure."""
     from matplotlib import pyplot  # looks for a display: who brings axes does not wait for it
 
     return pyplot.subplots(figsize=(4.0, 3.2), layout="constrained")[1]
 
 
 def _maximum(study: Study, model: Any) -> np.ndarray:
-    """Where the mean is largest in the feasible set, in the unit cube. (d,)."""
+    """Point (d,) of the unit cube with the largest mean in the feasible set: searched for a posterior, the optimum of
+    an aggregate. Raises `InputError` for a model of another type.
+    """
     if isinstance(model, Aggregate):
         return np.asarray(model.optimum.x)
     if not isinstance(model, Posterior):
@@ -74,17 +77,20 @@ def _maximum(study: Study, model: Any) -> np.ndarray:
 
 
 def _places(names: tuple[str, ...], pair: Any) -> tuple[int, int]:
+    """Indices of a pair of parameters. Raises `InputError` unless they are two different names of `names`."""
     if len(pair) != 2 or len(set(pair)) != 2 or not set(pair) <= set(names):
         raise InputError(f"draw_map: pair is {tuple(pair)}; give two of {', '.join(names)}.")
     return names.index(pair[0]), names.index(pair[1])
 
 
 def _mean_and_variance(model: Any, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and variance (m,) of a posterior or an aggregate at points (m, d) of the unit cube, as NumPy arrays."""
     mean, variance = model.surface(x) if isinstance(model, Aggregate) else model.predict(x)
     return np.asarray(mean), np.asarray(variance)
 
 
 def _curve(axes: Axes, study: Study, model: Any) -> None:
+    """Draw the model of a study with one parameter on `axes`, as a curve with its standard deviation."""
     side = np.linspace(0.0, 1.0, _CELLS)
     mean, variance = _mean_and_variance(model, side[:, None])
     physical = np.asarray(study.space.parameters[0].to_physical(jnp.asarray(side)))

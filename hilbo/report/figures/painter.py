@@ -1,7 +1,7 @@
-"""A second process that writes figures, so that two cores draw.
+"""A second process that writes figures, so that two cores draw at the same time.
 
-It is forked before this process has threads, loads matplotlib while this one loads JAX, and ends with it. A figure is
-the same files, byte for byte, whoever writes it.
+It is forked before this process has threads, loads matplotlib while this one loads JAX, and ends with it. A figure
+gives the same files, byte for byte, in either process.
 """
 
 import contextlib
@@ -24,8 +24,11 @@ _painter: list[Connection] = []
 
 
 def begin_painter() -> None:
-    """From now on `write_figures` has a second process. Nothing happens where there is one core, where nothing can be
-    forked, and where a fork is unsafe: once there are threads, as JAX has."""
+    """Start the second process, which `write_figures` uses from then on, once per process.
+
+    Nothing happens if it is already running, on one core, on macOS and systems without fork, and if a fork is unsafe:
+    after threads were started or JAX was imported.
+    """
     if _painter or not hasattr(os, "fork") or sys.platform == "darwin" or (os.cpu_count() or 1) < 2:
         return
     if threading.active_count() > 1 or "jax" in sys.modules:
@@ -38,7 +41,12 @@ def begin_painter() -> None:
 
 
 def write_figures(figures: Mapping[str, Any], folder: Path) -> dict[str, bytes]:
-    """Write matplotlib figures by name, as `files.write_figure` does: name -> PNG, in their order."""
+    """Write matplotlib figures by name, each as PNG, SVG and PDF, into an existing folder; return their PNGs by name,
+    in the order given.
+
+    The second process, if it runs, takes figures from the front and this one from the back. If it fails, this process
+    writes what is missing.
+    """
     from hilbo.report.figures.files import write_figure
 
     left, written = deque(figures.items()), {}
@@ -56,7 +64,11 @@ def write_figures(figures: Mapping[str, Any], folder: Path) -> dict[str, bytes]:
 
 
 def _give(painter: Connection, left: deque[tuple[str, Any]], folder: Path, written: dict[str, bytes]) -> None:
-    """Give the painter one figure after the other, from the front."""
+    """Send figures from the front of `left` to the second process, one after the other, and put their PNGs into
+    `written`.
+
+    Ends when none are left, or when the process has ended, which is then forgotten.
+    """
     with contextlib.suppress(IndexError):
         while True:
             name, figure = left.popleft()
@@ -71,7 +83,10 @@ def _give(painter: Connection, left: deque[tuple[str, Any]], folder: Path, writt
 
 
 def _paint(pipe: Connection, others: Connection) -> None:
-    """The second process: figures in, PNGs out; None for one that cannot be drawn, as the first will find, too."""
+    """Main loop of the second process: receive figures through `pipe`, write them, send back their PNGs, or None for
+    one that cannot be drawn. Interruptions are ignored; it ends when the pipe is closed. `others`: the parent's end,
+    closed here.
+    """
     others.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process decides what an interruption ends
     for backend in ("agg", "pdf", "svg"):  # loaded before they are needed

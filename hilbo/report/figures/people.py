@@ -1,4 +1,4 @@
-"""Figures of people and of their answers: how well each one answers, and what the posterior would answer again."""
+"""Figures of participants and their responses: response quality, and the posterior predictive check."""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,7 +15,10 @@ __all__ = ["people_figure", "predictive_check"]
 @styled
 def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
     """Consistency, lapse rate and drift of every participant: a line for the 95 % interval, a mark for the estimate if
-    there is one; red crosses: left out."""
+    there is one; red crosses: excluded participants.
+
+    `people`: of `measure_people`; `left_out`: excluded participant -> reason.
+    """
     rows = np.arange(len(people))[::-1]
     out = people["participant"].isin(list(left_out)).to_numpy()
     figure, panels = new_figure(TWO_COLUMNS, 1.2 + 0.14 * max(len(people), 4), 1, 3, sharey=True)
@@ -38,7 +41,10 @@ def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
 def predictive_check(
     responses: Sequence[str], observed: Float[np.ndarray, " C"], predicted: Float[np.ndarray, "draws C"]
 ) -> Figure:
-    """Shares of the answers given, and of those that the posterior would give again."""
+    """Observed response proportions (bars), and those of responses drawn from the posterior (median, 95 % interval).
+
+    `observed` (C,), `predicted` (draws, C): fractions.
+    """
     positions = np.arange(len(responses))
     low, middle, high = 100 * np.percentile(predicted, [2.5, 50, 97.5], axis=0)
     figure, axes = new_figure(ONE_COLUMN, 2.5)

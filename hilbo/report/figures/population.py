@@ -1,4 +1,4 @@
-"""Figures of how people are aggregated: the rules side by side, and how much of the space the answers cover."""
+"""Figures of aggregation: comparison of the methods, and the part of the space that the responses cover."""
 
 from collections.abc import Callable
 from typing import Any
@@ -28,8 +28,11 @@ _CELLS = 61
 
 @styled
 def rules_figure(content: dict[str, Any]) -> Figure:
-    """Out-of-sample prediction by every rule: how much worse than the best (density; bars: two standard errors of the
-    paired difference), and the share within the central 95 %."""
+    """Cross-validated prediction by every aggregation method. Left: negative log density minus the best one's (bars:
+    two standard errors of the paired difference); right: share of responses in the central 95 %.
+
+    `content`: of `rule_comparison.compare`; methods without a density are left out.
+    """
     rules = {rule: entry for rule, entry in content["rules"].items() if "negative_log_density" in entry}
     order = sorted(rules, key=lambda rule: -rules[rule]["negative_log_density"])
     rows = np.arange(len(order))
@@ -49,7 +52,10 @@ def rules_figure(content: dict[str, Any]) -> Figure:
 
 @styled
 def reliability_figure(content: dict[str, Any]) -> Figure:
-    """Predicted probabilities of categories against how often they were chosen, for two rules."""
+    """Calibration curve: observed frequency against predicted probability of a category, for "bcm" and "hierarchical".
+
+    `content`: of `rule_comparison.compare`; a method without bins has an empty line.
+    """
     figure, axes = new_figure(ONE_COLUMN, 3.0)
     axes.plot([0, 1], [0, 1], color=GREY, linewidth=1)
     for rule, colour, marker in (("bcm", ORANGE, "s"), ("hierarchical", BLUE, "o")):
@@ -66,8 +72,11 @@ def reliability_figure(content: dict[str, Any]) -> Figure:
 def coverage_figure(
     study: Study, predict: Callable[..., Any], point: Float[np.ndarray, " d"], prior: float, limit: float = 0.8
 ) -> Figure:
-    """The map's standard deviation over what it is without answers (of variance `prior`), on the slice of the first two
-    parameters through `point`; hatched where it is above `limit`: nobody's answers say much there."""
+    """Standard deviation of the map over that without responses, on the slice of the first two parameters through
+    `point` (d,) of the unit cube; hatched where it is above `limit`.
+
+    `predict`: points (m, d) -> mean and variance (m,); `prior`: variance of the map without responses.
+    """
     parameters = study.space.parameters
     side = np.linspace(0.0, 1.0, _CELLS)
     figure, axes = new_figure(ONE_COLUMN, 2.9)

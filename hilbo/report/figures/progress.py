@@ -1,4 +1,4 @@
-"""Figures of how optima come about: the population's and everybody's own over the trials."""
+"""Figures of convergence: the population's optimum and the individual ones over the trials."""
 
 from collections.abc import Mapping
 
@@ -31,10 +31,10 @@ __all__ = ["individual_convergence", "population_convergence", "progress_figure"
 
 @styled
 def individual_convergence(study: Study, cohort: Cohort, progress: Progress) -> Figure:
-    """Left: everybody's running optimum against their final one, and against that of a half of the people without them.
-    Right: answers in the highest category so far.
+    """Left: NRMSE of individual optima after each number of trials to their final ones, and to the optimum of half of
+    the other participants. Right: cumulative responses in the highest category.
 
-    Median and quartiles over people. Paper, figure 5.
+    Median and quartiles over participants. Paper, figure 5.
     """
     trials, (_, errors) = progress.counts, progress.to_end()
     figure, (left, right) = new_figure(TWO_COLUMNS, 2.6, 1, 2)
@@ -50,7 +50,9 @@ def individual_convergence(study: Study, cohort: Cohort, progress: Progress) -> 
 
 
 def _top_answers(axes, study: Study, cohort: Cohort, trials: np.ndarray, xlabel: str) -> None:
-    """Answers in the highest category so far: median and quartiles over participants."""
+    """Draw the cumulative number of responses in the highest category on `axes`: median and quartiles over
+    participants. `trials`: numbers of trials.
+    """
     top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
     band(axes, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
     axes.set(xlabel=xlabel, ylabel=f'answers "{plain(study.responses[-1])}" so far', ylim=(0, None))
@@ -61,8 +63,10 @@ def _top_answers(axes, study: Study, cohort: Cohort, trials: np.ndarray, xlabel:
 
 @styled
 def population_convergence(progress: Progress, references: Mapping[str, Float[np.ndarray, " d"]]) -> Figure:
-    """The population's running optimum against its final one, and against named references (system identification,
-    the truth); dashed, that of one half of the people against the other half's. Paper, figure 7b."""
+    """NRMSE of the population's optimum after each number of trials to its final one, and to named `references` (d,) in
+    the unit cube, such as system identification or the truth, at most two; dashed: between the optima of random halves
+    of the participants. Paper, figure 7b.
+    """
     looks = [(RED, "o", "-"), (BLUE, "s", "--"), (GREEN, "^", "-.")]
     targets = {"its final optimum": progress.population[-1]} | dict(references)
     figure, axes = new_figure(ONE_COLUMN, 2.7)
@@ -81,7 +85,9 @@ def population_convergence(progress: Progress, references: Mapping[str, Float[np
 
 @styled
 def progress_figure(study: Study, population: CohortResults, truth: Float[np.ndarray, " d"] | None = None) -> Figure:
-    """How the optima settle (left, NRMSE to the last trial's, or to the truth), and answers in the top category."""
+    """Left: NRMSE of individual and population optima, after each number of trials, to the last ones or to the `truth`
+    (d,) in the unit cube. Right: cumulative responses in the top category. Waits for the progress to be computed.
+    """
     progress = population.progress
     trials = progress.counts
     to_end, individual_errors = progress.to_end()

@@ -1,4 +1,4 @@
-"""Figure of class regions: the most probable answer around an optimum, and tolerance intervals (paper, figure 8)."""
+"""Figure of class regions: the most probable response around an optimum, and tolerance intervals (paper, figure 8)."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,10 +23,11 @@ _CELLS = 101  # along a side
 
 @styled
 def class_regions(readings: Mapping[str, Reading]) -> Figure:
-    """The most probable answer around each reading's optimum, and its tolerance intervals. Paper, figure 8.
+    """The most probable response around the optimum of each of several analyses, and its tolerance intervals. Paper,
+    figure 8.
 
     One row for each reading (fixed and optimised hyperparameters), with slices of the first parameter with the second
-    and with the third; of two parameters or one, the readings stand side by side. White: may not be rendered.
+    and with the third; of two parameters or one, the readings are side by side. White: infeasible.
     """
     study = next(iter(readings.values())).study
     d, labels = study.space.dim, [*map(plain, study.responses)]
@@ -50,6 +51,9 @@ def class_regions(readings: Mapping[str, Reading]) -> Figure:
 
 
 def _regions(axes, reading, i, j, shades):
+    """Draw the most probable response over parameters `i` and `j` through the optimum on `axes`, in the colours
+    `shades`, with both tolerance intervals and the optimum.
+    """
     study, best = reading.study, np.asarray(reading.aggregate.optimum.x)
     grid = plane(study, best, (i, j))
     likeliest = np.argmax(np.asarray(_probabilities(reading, jnp.asarray(grid.points))), axis=1)
@@ -62,7 +66,9 @@ def _regions(axes, reading, i, j, shades):
 
 
 def _interval(axes, reading, index, i, j):
-    """The tolerance interval of a parameter as a line along the slice it was read on, with a bar at each end."""
+    """Draw the tolerance interval of parameter `index` on `axes` of parameters `i` and `j`, as a line along the slice
+    on which it was computed, with dots at the ends; nothing if there is none.
+    """
     study = reading.study
     parameter = study.space.parameters[index]
     interval, _ = reading.tolerances.get(parameter.name, (None, None))  # levels have none
@@ -76,6 +82,9 @@ def _interval(axes, reading, index, i, j):
 
 
 def _class_curves(axes, reading, shades):
+    """Draw the probabilities of the responses over the only parameter on `axes`, stacked, in the colours `shades`, with
+    the tolerance interval if there is one.
+    """
     study = reading.study
     side = jnp.linspace(0.0, 1.0, _CELLS)
     physical_side = np.asarray(study.space.parameters[0].to_physical(side))
@@ -89,4 +98,5 @@ def _class_curves(axes, reading, shades):
 
 
 def _probabilities(reading, x):
+    """Probabilities (m, C) of a new participant's responses at points (m, d) of the unit cube, by one reading."""
     return reading.aggregate.class_probabilities(reading.study.gp.likelihood, x)

@@ -1,7 +1,7 @@
-"""Figures of a study's report, beside the paper's figures 4 to 8.
+"""Figures of a study's report, in addition to the paper's figures 4 to 8.
 
-As in `maps`, a figure is a function from results to a matplotlib `Figure`. What differs does so by shape, hatching
-or words too, never by colour alone: the pages are printed, and read by the colour-blind.
+As in `maps`, a figure is a function from results to a matplotlib `Figure`. Differences are shown by shape, hatching or
+text too, never by colour alone, for prints and for readers with colour-blindness.
 """
 
 from typing import Any
@@ -45,16 +45,17 @@ _CELLS = 101
 
 
 def typical_person(analysis: Analysis) -> int:
-    """Whose own optimum is nearest to the median distance from the population's: shown as the example."""
+    """Row of the participant whose distance (NRMSE) from individual to population optimum is the median one."""
     x, best = np.asarray(analysis.aggregate.individuals.x), np.asarray(analysis.aggregate.optimum.x)
     miss = np.asarray(nrmse(x, best, analysis.study.gp.kernel.levels))
     return int(np.argsort(miss, kind="stable")[(len(miss) - 1) // 2])
 
 
 def posterior_progress(study: Study, cohort: Cohort, progress: Progress, row: int) -> Figure:
-    """One participant's posterior mean after their first trials, sliced at their final third parameter.
+    """Posterior means of one participant (`row`) after growing numbers of trials, side by side, with the trials.
 
-    Paper, figure 4.
+    All are sliced at the third parameter of the participant's last optimum; the star is each mean's own optimum. Paper,
+    figure 4.
     """
     person, optima = cohort.rows(np.array([row])), progress.individual[progress.at(progress.moments), row]
     maps = {f"{count} trials": posterior.predict for count, posterior in progress.person(row).items()}
@@ -76,8 +77,12 @@ def posterior_progress(study: Study, cohort: Cohort, progress: Progress, row: in
 def sets_on_map(
     study: Study, surface, sets: Sets | None, best: Float[np.ndarray, " d"], cohort: Cohort, prior: ArrayLike
 ) -> tuple[Figure, bool]:
-    """The population map through its best, mid and worst sets, hatched where it is hardly sampled, and whether there
-    is such a part. Paper, figure 6a. `prior`: the map's variance where nobody answered (`RuleMap.map_prior`)."""
+    """The population map sliced through its best, mid and worst sets, hatched where its standard deviation is above
+    `UNKNOWN` times that without responses; and whether any part is hatched. Paper, figure 6a.
+
+    `sets`: None shows the optimum `best` (d,) alone; `prior`: the map's variance without responses
+    (`RuleMap.map_prior`). With one parameter it is a curve, without hatching.
+    """
     points: dict[str, Any] = {"best": best}
     if sets is not None:
         points = dict(zip(_MARKS, np.asarray(sets.x), strict=True))
@@ -106,7 +111,9 @@ def sets_on_map(
 
 
 def _hatch(axes, values: Slice, prior: ArrayLike) -> bool:
-    """Hatch what is feasible and of which the map knows less than `UNKNOWN`; whether there is such a part."""
+    """Hatch the feasible part of a slice on `axes` in which the standard deviation is above `UNKNOWN` times that
+    without responses; return whether there is such a part.
+    """
     unknown = (values.sd > UNKNOWN * np.sqrt(np.asarray(prior))).astype(float)  # NaN is not
     if unknown.any():
         with mpl.rc_context({"hatch.linewidth": 0.5, "hatch.color": "white"}):
@@ -115,6 +122,7 @@ def _hatch(axes, values: Slice, prior: ArrayLike) -> bool:
 
 
 def _mark(axes, study, name, x):
+    """Mark a point `x` (d,) of the unit cube as the set `name` ("best", "mid" or "worst") on `axes`."""
     marker, size, colour = _MARKS[name]
     look = {"marker": marker, "s": size, "color": colour, "edgecolor": "black", "linewidth": 0.7}
     axes.scatter(*np.asarray(study.space.to_physical(np.asarray(x)))[:2], zorder=5, clip_on=False, **look)
@@ -122,6 +130,7 @@ def _mark(axes, study, name, x):
 
 @styled
 def _sets_on_curve(study, surface, points):
+    """Figure of `sets_on_map` for one parameter; `points`: set name -> point (1,) of the unit cube."""
     figure, axes = new_figure(ONE_COLUMN, 2.6)
     side = jnp.linspace(0.0, 1.0, _CELLS)
     mean, variance = (np.asarray(moment) for moment in surface(side[:, None]))

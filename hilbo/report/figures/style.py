@@ -55,40 +55,44 @@ _WIDEST = 1.1  # inches of an entry of a legend
 
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **subplots: Any) -> tuple[Figure, Any]:
-    """A figure (inches) and its axes, one or an array, as `Figure.subplots` returns them."""
+    """A matplotlib figure (inches) and its axes, one or an array, as `Figure.subplots` returns them; not shown, and no
+    part of pyplot. `subplots`: further arguments of `Figure.subplots`.
+    """
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, columns, **subplots)
 
 
 def few_ticks(axis, count: int = 4, *, integer: bool = False) -> None:
-    """At most about `count` ticks along a linear axis, so that their numbers do not overlap."""
+    """Limit the ticks of a linear axis to about `count`, so that their numbers do not overlap; `integer`: at
+    integers.
+    """
     axis.set_major_locator(MaxNLocator(count, integer=integer, steps=[1, 2, 2.5, 5, 10]))
 
 
 def legend(figure, handles) -> None:
-    """A legend above the axes, in as many columns as the figure is wide enough for."""
+    """Put a legend of these handles above the axes of a figure, in as many columns as its width allows."""
     across = max(1, min(len(handles), int(figure.get_figwidth() / _WIDEST)))
     size = STYLE["legend.fontsize"]
     figure.legend(handles=handles, loc="outside upper center", ncols=across, frameon=False, fontsize=size)
 
 
 def plain(words: str) -> str:
-    """Words of a user as text of a figure: matplotlib reads what is between two dollars as a formula."""
+    """A user's text, with dollar signs escaped: matplotlib reads text between two of them as a formula."""
     return words.replace("$", r"\$")
 
 
 def score_label(study: Study) -> str:
-    """Label of axes and colour bars of the latent function."""
+    """Label of axes and colour bars for the latent function: the study's attribute and f."""
     return f"{plain(study.file.attribute)} f"
 
 
 def title(axes, text: str) -> None:
-    """The title of a panel."""
+    """Set the title of a panel."""
     axes.set_title(text, fontsize=STYLE["axes.titlesize"])
 
 
 def label_axes(axes, study: Study, i: int, j: int) -> None:
-    """Names, units, limits and scales of two parameters."""
+    """Set labels (name and unit), limits, scales and ticks of `axes` for parameter `i` across and `j` up."""
     for which, parameter in (("x", study.space.parameters[i]), ("y", study.space.parameters[j])):
         unit = f" ({_unit(parameter.unit)})" if parameter.unit else ""
         getattr(axes, f"set_{which}label")(_name(parameter.name) + unit)
@@ -106,7 +110,9 @@ def label_axes(axes, study: Study, i: int, j: int) -> None:
 
 
 def _steps_on(axes, which, parameter) -> None:
-    """The axis of a discrete parameter: half a step of margin at both ends, levels by their names."""
+    """Set limits and ticks of one axis (`which`: "x" or "y") for a discrete parameter: half a step of margin, and the
+    names of levels.
+    """
     getattr(axes, f"set_{which}lim")(parameter.low - 0.5 * (parameter.scale == "linear"), parameter.high + 0.5)
     if parameter.levels:
         getattr(axes, f"set_{which}ticks")(range(len(parameter.levels)), [*map(plain, parameter.levels)])
@@ -115,16 +121,20 @@ def _steps_on(axes, which, parameter) -> None:
 
 
 def _name(name: str) -> str:
+    """A parameter's name as text of a figure: α, K₁ and B₁ as symbols, underscores as spaces."""
     symbols = {"alpha": "α", "K1": "$K_1$", "B1": "$B_1$"}
     return symbols[name] if name in symbols else plain(name.replace("_", " "))
 
 
 def _unit(unit):
+    """A unit of a study file as text of a figure."""
     return plain(unit).replace("s^alpha", "s$^α$").replace(".", "·")
 
 
 def level_words(study: Study, index: int, unit_value: float) -> str:
-    """A parameter's name and physical value."""
+    """A parameter's name, physical value and unit as text, such as "K₁ = 3 N/mm". `index`: of the parameter;
+    `unit_value`: its value in the unit cube.
+    """
     parameter = study.space.parameters[index]
     value = float(parameter.to_physical(np.asarray(float(unit_value))))
     words = parameter.words(value) if parameter.discrete else f"{value:.3g}"
@@ -132,13 +142,15 @@ def level_words(study: Study, index: int, unit_value: float) -> str:
 
 
 def star(axes, study: Study, x, pair: tuple[int, int] = (0, 1)) -> None:
-    """An optimum, on axes of two of the parameters."""
+    """Draw a star at a point `x` (d,) of the unit cube on `axes` of the parameters `pair`, in physical units."""
     point = np.asarray(study.space.to_physical(np.asarray(x)))[list(pair)]
     axes.plot(*point, marker="*", markersize=12, color=RED, markeredgecolor="white", clip_on=False, zorder=5)
 
 
 def band(axes, trials, values, colour: str, label: str) -> None:
-    """Median over the first axis of `values` as a line, quartiles as a band; NaN are ignored."""
+    """Draw the median over the first axis of `values` (k, m) on `axes` as a line over `trials` (m,), and the quartiles
+    as a band; NaN are ignored.
+    """
     low, middle, high = np.nanpercentile(values, [25, 50, 75], axis=0)
     axes.fill_between(trials, low, high, color=colour, alpha=0.25, linewidth=0)
     axes.plot(trials, middle, color=colour, label=label)

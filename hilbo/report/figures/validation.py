@@ -1,7 +1,7 @@
 """Figures of validation sessions: classes of the sets, preferences of their pairs, the aggregate's set against others'.
 
-As in `maps`, a figure is a function from results to a matplotlib `Figure`, and nothing is shown or saved here.
-Shades say the same as the numbers that are written in them.
+As in `maps`, a figure is a function from results to a matplotlib `Figure`, and nothing is shown or saved here. Shades
+repeat the numbers written in the cells.
 """
 
 import numpy as np
@@ -46,7 +46,7 @@ def aggregate_best_figure(people: pd.DataFrame, overall: pd.DataFrame) -> Figure
 
 
 def preference_rows(preferences: pd.DataFrame) -> pd.DataFrame:
-    """Of each pair the counts and its widest interval, docs/methods/statistics.md."""
+    """For each pair of sets the row of `preferences` with the widest interval (docs/methods/statistics.md)."""
     if preferences.empty:
         return preferences
     groups = preferences.groupby(["set", "over"], sort=False)
@@ -54,7 +54,9 @@ def preference_rows(preferences: pd.DataFrame) -> pd.DataFrame:
 
 
 def _widest(rows):
-    """The widest interval among Wilson's and the clustered ones, or where all agreed that of the people."""
+    """The row with the widest interval among Wilson's and the clustered ones, or among the exact ones over participants
+    if there are such, where all agreed; the first row of a pair that was only tied.
+    """
     if "errors" not in rows or rows["errors"].isna().all():  # a pair that was only ever tied
         return rows.iloc[0]
     people = rows[rows["errors"].str.startswith("exact, of")]
@@ -65,6 +67,7 @@ def _widest(rows):
 
 
 def _matrix(axes, counts):
+    """Draw a confusion matrix on `axes`: share of each row and count in each cell, a dash in rows without responses."""
     totals = counts.to_numpy().sum(axis=1, keepdims=True)
     shares = np.divide(counts.to_numpy(), totals, out=np.zeros(counts.shape), where=totals > 0)
     axes.imshow(shares, cmap="cividis", vmin=0, vmax=1, aspect="auto")
@@ -79,6 +82,7 @@ def _matrix(axes, counts):
 
 
 def _rates(axes, rows):
+    """Draw preference rates with their intervals on `axes`, one row for each pair; a text if there are none."""
     axes.axvline(0.5, color=GREY, linestyle="--", linewidth=1)
     axes.set(xlim=(-0.02, 1.02), xlabel="share preferring the first")
     if rows.empty:

@@ -1,4 +1,4 @@
-"""A checklist of Bayesian reporting, filled in with what hilbo knows, and with a line for what only the authors know.
+"""A checklist of Bayesian reporting, filled in from the analysis, with lines left open for the authors.
 
 The items follow those of Kruschke (2021), Bayesian Analysis Reporting Guidelines, Nature Human Behaviour 5:1282-1291,
 in our own words.
@@ -25,7 +25,9 @@ _APPROXIMATIONS = {
 
 
 class Item(NamedTuple):
-    """What a reader asks, and the answer: `known` from the files, `to_write` by the authors (either may be empty)."""
+    """One item: the `question`, the answer `known` from the files, and what remains `to_write` by the authors; either
+    of the last two may be empty.
+    """
 
     question: str
     known: str
@@ -33,7 +35,9 @@ class Item(NamedTuple):
 
 
 def checklist(analysis: Analysis, content: dict[str, Any], validated: bool) -> list[Item]:
-    """The items of one material; `content`: its part of result.json; `validated`: whether people were asked again."""
+    """The items of the checklist for one material. `content`: its part of result.json; `validated`: whether there was a
+    validation session.
+    """
     return [
         Item("Goal", "", f"{_OPEN}what is to be found out, and why by a Bayesian analysis."),
         Item("Data", _data(analysis), ""),
@@ -54,6 +58,7 @@ def checklist(analysis: Analysis, content: dict[str, Any], validated: bool) -> l
 
 
 def _data(analysis):
+    """Sentence on the data: participants, responses each, parameters, and number of excluded participants."""
     counts, study = analysis.cohort.counts(), analysis.study
     many = f"{counts.min()}" if counts.min() == counts.max() else f"{counts.min()} to {counts.max()}"
     return (
@@ -63,6 +68,9 @@ def _data(analysis):
 
 
 def _model(analysis):
+    """Sentence on the model: likelihood, covariance, hyperparameters and whether they were learnt, aggregation
+    method.
+    """
     study, gp = analysis.study, analysis.study.gp
     given = "as the study file states" if study.learnt is None else "learnt from these answers by a fixed recipe"
     return (
@@ -74,6 +82,7 @@ def _model(analysis):
 
 
 def _prior(analysis):
+    """Sentence with the response probabilities that the model predicts without data."""
     gp = analysis.study.gp
     chances = np.asarray(gp.likelihood.class_probabilities(np.zeros(()), np.asarray(gp.kernel.variance)))
     shares = ", ".join(f"{label} {percent(p)}" for label, p in zip(analysis.study.responses, chances, strict=True))
@@ -81,6 +90,7 @@ def _prior(analysis):
 
 
 def _computation(analysis, content):
+    """Sentence with the inference method and the number of fits that converged."""
     certificates = [person["certificate"] for person in content["participants"]]
     good = sum(bool(c["converged"]) for c in certificates)
     return (
@@ -90,6 +100,7 @@ def _computation(analysis, content):
 
 
 def _posterior(analysis, content):
+    """Sentence with the optimum, its latent score and standard deviation."""
     best = content["optimum"]
     where = ", ".join(f"{name} {number(value)}" for name, value in best["parameters"].items())
     return (
@@ -100,6 +111,9 @@ def _posterior(analysis, content):
 
 
 def _prediction(content, validated):
+    """Sentence with the cross-validated cost of the map and of constant proportions, and whether there was a
+    validation.
+    """
     check = content["model_check"]
     if check is None:
         return "Too few participants to leave one out."
@@ -112,10 +126,12 @@ def _prediction(content, validated):
 
 
 def _decisions(analysis):
+    """The line on decisions, which is left to the authors."""
     return f"{_OPEN}what is decided by these results, by which bound, and whether it was set before."
 
 
 def _sensitivity(content):
+    """Sentence with the shift of the optimum by learnt hyperparameters and by another inference."""
     parts = [f"hyperparameters of maximum evidence move the optimum by {percent(content['optimised']['nrmse'], 1)}"]
     if "other_inference" in content:
         other = content["other_inference"]
@@ -124,4 +140,5 @@ def _sensitivity(content):
 
 
 def _each(values: Any) -> str:
+    """Numbers of an array as text with four digits, separated by commas."""
     return ", ".join(f"{float(v):.4g}" for v in np.ravel(np.asarray(values)))

@@ -1,4 +1,4 @@
-"""Every rule of aggregation beside the study's: comparison.json, comparison.csv, figures, and a section of the page."""
+"""Comparison of all aggregation methods: comparison.json, comparison.csv, figures, and a section of the page."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +21,7 @@ _COLUMNS += ("central_95", "central_95_error", "z2", "covered", "optimum_sd")
 
 
 class Compared(NamedTuple):
-    """A comparison of rules: as data, as a section of the page, and its figures."""
+    """A comparison of aggregation methods: as data, as a section of the page, and its figures for `page`."""
 
     content: Content
     section: Content
@@ -29,8 +29,9 @@ class Compared(NamedTuple):
 
 
 def write_comparison(study: Study, aggregate: Aggregate, content: Content, folder: Path) -> Compared:
-    """Write comparison.json, comparison.csv and the figures into the folder. `content`: of
-    `rule_comparison.compare`."""
+    """Write comparison.json, comparison.csv and the figures of a comparison into an existing folder; return data,
+    section and figures. `content`: of `rule_comparison.compare`.
+    """
     from hilbo.report.figures import population as plotting
 
     (folder / "comparison.json").write_text(as_json(content))
@@ -45,7 +46,9 @@ def write_comparison(study: Study, aggregate: Aggregate, content: Content, folde
 
 
 def comparison_table(content: Content) -> pd.DataFrame:
-    """A row for each rule."""
+    """The rows of comparison.csv, one for each method: measures of prediction, its optimum, and the most influential
+    participant; `refused` has the reason for a method that could not be used.
+    """
     rows = []
     for rule, entry in content["rules"].items():
         row = {"rule": rule} | {name: entry.get(name) for name in _COLUMNS} | entry.get("optimum", {})
@@ -56,7 +59,9 @@ def comparison_table(content: Content) -> pd.DataFrame:
 
 
 def comparison_section(study: Study, content: Content) -> Content:
-    """What the page shows: `words`, `head` and `rows` of the table, best first, and who was `refused`, with reason."""
+    """Section of the page: `words` (the recommendation), `head` and `rows` of the table, best method first, and
+    `refused`: the methods that could not be used, with reasons.
+    """
     rules = content["rules"]
     compared = {rule: entry for rule, entry in rules.items() if "refused" not in entry}
     order = sorted(compared, key=lambda rule: compared[rule]["negative_log_density"])
@@ -72,6 +77,7 @@ def comparison_section(study: Study, content: Content) -> Content:
 
 
 def _cells(entry):
+    """Cells of one method's row on the page, as texts; the best method has no difference."""
     best = entry["difference"] == 0.0
     difference = "" if best else f"{entry['difference']:+.3f} ± {entry['difference_error']:.3f}"
     cells = [f"{entry['negative_log_density']:.3f}", difference, percent(entry["central_95"]), f"{entry['z2']:.2f}"]

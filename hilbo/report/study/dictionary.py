@@ -1,6 +1,6 @@
 """dictionary.csv: unit and meaning of every column of a report's tables, from `hilbo.study.file.columns`.
 
-A table that has a column without an entry is an error, so that no column is written that nobody explains.
+A column without an entry is an error, so that no table is written with an unexplained column.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,10 @@ __all__ = ["dictionary"]
 
 
 def dictionary(tables: Mapping[str, pd.DataFrame], study: Study) -> pd.DataFrame:
-    """A row for each column of the tables: `table`, `column`, `unit`, `meaning`. Raises KeyError for one without."""
+    """The rows of dictionary.csv, one for each column of the `tables`: `table`, `column`, `unit`, `meaning`.
+
+    Raises `KeyError` for a column without an entry.
+    """
     rows = []
     for name, table in tables.items():
         known = meanings(name, study.file.space)

@@ -1,9 +1,9 @@
-"""What a study's results say of the paper's hypotheses H1 to H4, item by item.
+"""Evidence of a study's results on the paper's hypotheses H1 to H4, item by item.
 
-Every item is a sentence with its figures, and whether it supports the hypothesis, contradicts it, or is inconclusive.
-The bounds are stated in the sentence; what ties with its bound is inconclusive, so that a verdict does not depend on
-which end of a scale is written first. Items are not counted, and none is a test of its own. Only a study that asks for
-it has this section (`[report] hypotheses = true`): the hypotheses are the paper's, not everybody's.
+Every item is a sentence with its numbers, and whether it supports the hypothesis, contradicts it, or is inconclusive.
+The bounds are stated in the sentence; a tie with the bound is inconclusive, so that a verdict does not depend on the
+direction of a scale. Items are not counted, and none is a test of its own. Only a study that asks for it has this
+section (`[report] hypotheses = true`): the hypotheses are the paper's.
 
     H1  individuals' parameters can be found by asking      H3  individuals need not have converged for that
     H2  a population's map has an optimum that people share  H4  it holds for other materials
@@ -29,7 +29,7 @@ _SAME = 1e-9  # rounding: numbers that are as near as this are equal
 
 
 class Results(NamedTuple):
-    """What is known of one material."""
+    """Results of one material, with its validation and its reference set (d,) in the unit cube, or None."""
 
     name: str
     analysis: Analysis
@@ -39,7 +39,7 @@ class Results(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """One item."""
+    """One item of evidence: a verdict, and a sentence that states the numbers and the bound."""
 
     side: Side
     text: str
@@ -53,7 +53,7 @@ class Hypothesis(NamedTuple):
 
 
 def hypotheses(results: Sequence[Results]) -> list[Hypothesis]:
-    """H1 to H3 by the first material, H4 by the others."""
+    """Evidence on the hypotheses H1 to H4: H1 to H3 from the first material, H4 from the others."""
     first = results[0]
     return [
         Hypothesis("H1", tuple(_individuals(first))),
@@ -64,18 +64,21 @@ def hypotheses(results: Sequence[Results]) -> list[Hypothesis]:
 
 
 def _side(one: float, other: float) -> Side:
-    """Whether one is more than the other, which supports; equal ones say nothing, nor does what is not known."""
+    """ "supports" if one > other, "contradicts" if less, "inconclusive" if they are equal to 1e-9 or one is NaN."""
     if np.isclose(one, other, rtol=_SAME, atol=_SAME) or np.isnan(one) or np.isnan(other):
         return "inconclusive"
     return "supports" if one > other else "contradicts"
 
 
 def _largest(row: np.ndarray, place: int) -> Side:
-    """Whether the number at a place is larger than all others of its row."""
+    """Whether the number at index `place` of a row is larger than all others, as `_side`; equal is inconclusive."""
     return _side(float(row[place]), float(np.delete(row, place).max()))
 
 
 def _individuals(results):
+    """Generate the evidence for H1: approach to the other participants' optimum, highest responses over the session,
+    and the likeliest response at the individual optima.
+    """
     analysis, study = results.analysis, results.analysis.study
     counts = analysis.progress.counts
     top, people = study.responses[-1], len(analysis.cohort.names)
@@ -108,7 +111,9 @@ def _individuals(results):
 
 
 def _nearer_to_others(progress):
-    """Whether individual optima come nearer to those of people who are not among them."""
+    """Evidence whether individual optima approach the optimum of participants who are not among them, from a third of
+    the trials to the last: by more than two standard errors.
+    """
     row = _early(progress.counts)
     early, late = (100 * progress.individual_to_half[k] for k in (row, -1))
     nearer = early - late
@@ -126,11 +131,14 @@ def _nearer_to_others(progress):
 
 
 def _early(counts):
-    """The row of the first third of the trials."""
+    """Index into `counts` (numbers of trials, rising) of the first one that is at least a third of the last."""
     return int(np.searchsorted(counts, max(int(counts[-1]) // 3, 1)))
 
 
 def _population(results):
+    """Generate the evidence for H2: distance of the optimum to the reference, probability of the highest response
+    there, and the validation.
+    """
     analysis, study = results.analysis, results.analysis.study
     best = analysis.aggregate.optimum
     if results.reference is not None:
@@ -157,6 +165,9 @@ def _population(results):
 
 
 def _validation(validated, responses):
+    """Generate the evidence of the validation sessions for H2: the confusion matrix, for three responses, and
+    coefficients of tables II to IV, as far as there are such.
+    """
     counts = validated.tables.confusion.to_numpy()
     if len(counts) == 3 and counts.sum(axis=1).all() and len(responses) == 3:
         sides = [_largest(row, place) for place, row in enumerate(counts)]
@@ -188,6 +199,9 @@ def _validation(validated, responses):
 
 
 def _convergence(results):
+    """Generate the evidence for H3: optima of random halves of the participants, and of everyone, after a third of the
+    trials.
+    """
     analysis = results.analysis
     progress = analysis.progress
     if len(progress.counts) <= 2 or not progress.splits:
@@ -220,6 +234,7 @@ def _convergence(results):
 
 
 def _materials(results):
+    """Generate the evidence for H4 from all materials but the first; inconclusive for one material."""
     if len(results) < 2:
         yield Evidence("inconclusive", "One material was studied.")
     for one in results[1:]:
@@ -229,6 +244,9 @@ def _materials(results):
 
 
 def _near(one):
+    """Generate evidence whether the population optimum is nearer to the reference than the median individual one; none
+    without reference.
+    """
     if one.reference is None:
         return
     analysis = one.analysis
@@ -242,6 +260,7 @@ def _near(one):
 
 
 def _preferred(name, validated):
+    """Generate evidence whether the aggregate's set was preferred (table IV); none without decided comparisons."""
     table = validated.regressions().get("IV")
     if table is None or validated.overall is None:
         return

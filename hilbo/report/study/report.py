@@ -1,8 +1,9 @@
-"""`hilbo report`: a folder of sessions as one page, in the paper's order, with figures (SVG, PNG) and tables (CSV).
+"""`hilbo report`: a folder of sessions as one page, in the paper's order, with figures (SVG, PNG, PDF) and tables
+(CSV).
 
-Each material gets its figures 4 to 8 and tables I to IV, its limits, its people and the passivity of every optimum;
-hypotheses H1 to H4 get a section each (`hilbo.report.study.hypotheses`). With several materials the files of each lie
-in a folder of its name. result.json holds everything by number, `inference.nc` the posterior for ArviZ, `map.nc` the
+Each material has its figures 4 to 8 and tables I to IV, its limits, its participants and the passivity of every
+optimum; hypotheses H1 to H4 have a section each (`hilbo.report.study.hypotheses`). With several materials the files of
+each are in a folder of its name. result.json has all numbers, `inference.nc` the posterior for ArviZ, `map.nc` the
 population map.
 """
 
@@ -47,9 +48,12 @@ def write_study(
     analyses: Mapping[str, Analysis] | None = None,
     comparison: bool = True,
 ) -> dict[str, Any]:
-    """Write the results folder of `hilbo report`; returns the content of result.json.
+    """Analyse a study's folder and write the results of `hilbo report` into the existing folder `out`; return the
+    content of result.json.
 
-    `analyses`: of materials (by name) whose results are known already. `comparison`: as `analyse`, of the others.
+    `say`: called with a text at each step; `analyses`: finished analyses by name of the material, which are not
+    repeated; `comparison`: whether the other ones also compare the aggregation methods. Raises `InputError` for data
+    that cannot be analysed.
     """
     results, contents, sections = [], {}, []
     analyses = {} if analyses is None else analyses
@@ -81,7 +85,11 @@ def write_study(
 
 
 def _page(folder: StudyFolder, content, sections, claims, compares: bool) -> str:
-    """Somebody who is on the map of one material at least is not left out. `compares`: rules, where people suffice."""
+    """The HTML of report.html. A participant counts as excluded if no material's map includes their responses.
+
+    `sections`, `claims`: of the materials and the hypotheses; `compares`: whether aggregation methods are compared
+    where there are enough participants.
+    """
     kept = {name for section in sections for name in section["participants"]}
     answered = kept.union(*(section["left_out"] for section in sections))
     return rendered(
@@ -99,6 +107,7 @@ def _page(folder: StudyFolder, content, sections, claims, compares: bool) -> str
 
 
 def _content(folder: StudyFolder, contents, claims, seed) -> dict[str, Any]:
+    """The content of result.json, from that of the materials by name, the hypotheses (`claims`) and the seed."""
     return {
         "materials": contents,
         "hypotheses": [{"number": h.number, "evidence": [e._asdict() for e in h.evidence]} for h in claims],
@@ -111,6 +120,9 @@ def _content(folder: StudyFolder, contents, claims, seed) -> dict[str, Any]:
 
 
 def _validated(material: Material, folder: StudyFolder, say) -> Validated | None:
+    """Statistics of a material's validation sessions, None if it has none; calls `say`. Raises `InputError` for a bad
+    table.
+    """
     if material.validation is None:
         return None
     say("validation sessions")
@@ -119,7 +131,9 @@ def _validated(material: Material, folder: StudyFolder, say) -> Validated | None
 
 
 def _write_material(material, analysis: Analysis, validated, folder: Path, seed):
-    """Files of one material; its content for result.json, and its section of the page."""
+    """Write all files of one material but result.json and report.html into an existing folder: inference.nc, map.nc,
+    figures and tables. Return its content for result.json, and its section of the page.
+    """
     study, people = analysis.study, people_of(analysis.study, analysis.aggregate)
     truth = material.reference if material.reference_name == "the truth" else None
     content = cohort_content(analysis.population, truth, people)
@@ -154,7 +168,7 @@ def _write_material(material, analysis: Analysis, validated, folder: Path, seed)
 
 
 def _tables(analysis: Analysis, material: Material, content, people) -> dict[str, pd.DataFrame]:
-    """The tables that every material has, by the names of their files."""
+    """Tables that every material has, by file name without .csv."""
     return {
         "optima": optima_table(content, people),
         "table_I": table_1(analysis, material.reference),
@@ -166,7 +180,7 @@ def _tables(analysis: Analysis, material: Material, content, people) -> dict[str
 
 
 def _optimised(analysis: Analysis) -> dict[str, Any]:
-    """The hyperparameters of maximum evidence, and how far the optimum moves by them."""
+    """Hyperparameters of maximum evidence, and the shift of the optimum by them (NRMSE), for result.json."""
     gp = analysis.maximum.gp
     return {
         "theta": np.asarray(gp.kernel.theta).tolist(),
@@ -177,7 +191,9 @@ def _optimised(analysis: Analysis) -> dict[str, Any]:
 
 
 def _section(material: Material, analysis: Analysis, validated, tables, pictures: Pictures, content) -> dict[str, Any]:
-    """What the page says of one material."""
+    """Section of the page for one material, as values for the template; `tables`: by file name, `content`: of its part
+    of result.json.
+    """
     from hilbo.report.figures.study import UNKNOWN, typical_person
 
     readings = {"fixed": analysis.fixed, "optimised": analysis.optimised}
@@ -210,7 +226,9 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
 
 
 def _alternatives(study: Study, table: pd.DataFrame) -> dict[str, Any]:
-    """Head and rows of the table of all optima on the page: no column without a number in it."""
+    """Head and rows (texts) of the page's table of all optima, without empty columns. `table`: of
+    `alternatives_table`.
+    """
     forms: dict[str, tuple[str, Any]] = {
         "mean": ("latent score", "{:.2f}".format),
         "sd": ("sd", "{:.2f}".format),
@@ -231,7 +249,7 @@ def _alternatives(study: Study, table: pd.DataFrame) -> dict[str, Any]:
 
 
 def _estimate(label: str, rule: str) -> str:
-    """The words of a row of `alternatives_table`."""
+    """Name on the page for the `label` of a row of `alternatives_table`; `rule`: the study's aggregation method."""
     if label in ROLES:
         return f"{label} of the sets to compare"
     name = "aggregate" if label == "population" else label.removeprefix("population, ")
@@ -239,19 +257,21 @@ def _estimate(label: str, rule: str) -> str:
 
 
 def _with_units(study: Study, table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
-    """A table whose first column names parameters, these with their units."""
+    """Columns and cells (texts) of a table whose column `parameter` gets units."""
     return _shown(table.assign(parameter=heads(study, table["parameter"])))
 
 
 def _shown(table: pd.DataFrame, digits: int = 4) -> tuple[list[str], list[list[str]]]:
-    """Columns and cells of a table on the page, numbers with so many digits."""
+    """Column names and cells of a table as texts, numbers with so many significant digits."""
     return list(map(str, table.columns)), [
         [_cell(value, digits) for value in row] for row in table.itertuples(index=False)
     ]
 
 
 def _tolerances(table):
-    """The tolerance intervals as they are read: each end with what it is, and with its interval."""
+    """Rows (texts) of the page's table of tolerance intervals: each end with its reason and its bootstrap interval, and
+    the share of resamples without an interval; dashes for what is missing.
+    """
     rows = []
     for row in table.to_dict("records"):
         resampled = np.isfinite(row["draws_without"])  # not of one person
@@ -270,6 +290,7 @@ def _tolerances(table):
 
 
 def _cell(value, digits=4):
+    """A value as text: numbers with so many significant digits, "–" for None and NaN, "∞" or "−∞" for infinity."""
     if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
         return "–" if value is None or np.isnan(value) else ("∞" if value > 0 else "−∞")
     if isinstance(value, float | np.floating):

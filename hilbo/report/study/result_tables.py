@@ -14,10 +14,12 @@ __all__ = ["alternatives_table", "convergence_table", "table_1", "tolerance_tabl
 
 
 def table_1(analysis: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
-    """The population optimum and the mean of the individual optima, beside the reference if there is one (paper,
-    table I): `parameter`, `reference`, `aggregate`, `error_percent`, `mean_of_optima`, `sd_of_optima`, ...
+    """Population optimum and mean of the individual optima, by parameter, next to the reference if there is one (paper,
+    table I). Columns `parameter`, `reference`, `aggregate`, `mean_of_optima`, `sd_of_optima`, `error_percent`,
+    `mean_error_percent`.
 
-    `reference` (d,): the parameter set that is known, in the unit cube.
+    `reference` (d,): the known parameter set, in the unit cube; None leaves its column and the errors out. Errors are
+    absolute, in per cent of the range; the standard deviation is NaN for one participant and for levels.
     """
     study, aggregate = analysis.study, analysis.aggregate
     mean, best = aggregate.mean_of_optima, aggregate.optimum.x
@@ -37,9 +39,12 @@ def table_1(analysis: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
 
 
 def convergence_table(analysis: Analysis) -> pd.DataFrame:
-    """After each number of trials: NRMSE of the population's running optimum to its last, and of the individuals'
-    (median, quartiles, of those who gave as many answers), both also to the optimum of a half of the people who are not
-    among them, and answers in the highest category so far (paper, figures 5 and 7b)."""
+    """After each number of trials (paper, figures 5 and 7b): NRMSE of the population's optimum to its last, of
+    individual optima to theirs (median, quartiles), of both to the optimum of half of the participants, and cumulative
+    responses in the highest category (median, quartiles).
+
+    The columns on halves are missing if there were too few participants to split.
+    """
     study, counts = analysis.study, analysis.progress.counts
     population_errors, individual_errors = analysis.progress.to_end()
     top = np.asarray((analysis.cohort.trials.q == len(study.responses) - 1) & analysis.cohort.trials.mask)
@@ -56,8 +61,12 @@ def convergence_table(analysis: Analysis) -> pd.DataFrame:
 
 
 def tolerance_table(analysis: Analysis) -> pd.DataFrame:
-    """Tolerance intervals under fixed and under optimised hyperparameters, with the bootstrap over people of their
-    ends; empty where the highest answer is not the likeliest at the optimum (paper, section VII)."""
+    """Tolerance intervals by parameter under fixed and under optimised hyperparameters, with bootstrap intervals of
+    their ends (paper, section VII).
+
+    An interval is NaN where the highest response is not the likeliest at the optimum; `draws_without`: share of
+    resamples without an interval.
+    """
     rows = []
     for name, reading in (("fixed", analysis.fixed), ("optimised", analysis.optimised)):
         for parameter, (interval, ends) in reading.tolerances.items():
@@ -82,8 +91,11 @@ def tolerance_table(analysis: Analysis) -> pd.DataFrame:
 
 
 def alternatives_table(analysis: Analysis) -> pd.DataFrame:
-    """Everything that could be presented as the optimum: parameters, latent score, probability of the highest answer,
-    and with a renderer how far from the passive boundary (N.s/m; negative is not passive)."""
+    """All estimates that could be presented as the optimum, a row each: parameters, latent score (mean, sd),
+    probability of the highest response, and with mechanics the passivity margin (N·s/m; negative is not passive).
+
+    Means of optima and sets have no score.
+    """
     study, aggregate = analysis.study, analysis.aggregate
     claims: dict[str, tuple[Any, Any]] = {"population": (aggregate.optimum.x, aggregate.optimum)}
     claims |= {f"population, {name}": (other.x, other) for name, other in aggregate.alternatives.items()}

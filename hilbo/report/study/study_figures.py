@@ -1,4 +1,4 @@
-"""The figures of a study's report by name; their titles and captions are in the page's template."""
+"""Figures of a study's report by name; their titles and captions are in the page's template."""
 
 from typing import Any
 
@@ -18,8 +18,12 @@ Figures = dict[str, Any]  # name -> figure
 def study_figures(
     analysis: Analysis, material: Material, shares: tuple[np.ndarray, np.ndarray]
 ) -> tuple[Figures, bool]:
-    """Figures 4, 5, 6a, 7 and 8, people, individual optima and the predictive check; and whether a part of the map is
-    hatched. `shares`: of `arviz_groups.predictive_shares`."""
+    """Matplotlib figures of one material by name (4, 5, 6a, 7 and 8 of the paper, participants, individual optima,
+    predictive check); and whether a part of the map is hatched as hardly sampled.
+
+    `shares`: observed and predicted response proportions, of `arviz_groups.predictive_shares`. "effects" is only for
+    spaces without a grid, "optima" not for one parameter.
+    """
     from hilbo.report.figures import maps, people, study
     from hilbo.report.figures import progress as progress_figures
     from hilbo.report.figures.effects import effects_figure
@@ -51,8 +55,9 @@ def study_figures(
 
 
 def comparison_figures(content: dict[str, Any]) -> Figures:
-    """Every rule with each person left out, and the reliability of two of them; `content`: of
-    `study.rule_comparison`."""
+    """Matplotlib figures of a comparison of aggregation methods: "comparison" and "reliability". `content`: of
+    `rule_comparison.compare`.
+    """
     from hilbo.report.figures import population
 
     return {"comparison": population.rules_figure(content), "reliability": population.reliability_figure(content)}
