@@ -1,4 +1,4 @@
-"""How well people answer, and how well a rule predicts people who are left out.
+"""Response quality of participants, and prediction of participants who are left out.
 
 Baselines included.
 """

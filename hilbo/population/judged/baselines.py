@@ -1,8 +1,8 @@
-"""What a population map has to beat: predictions of people's answers that know nothing of how a function may look.
+"""Baselines for a population map: predictions of responses that do not use a Gaussian process.
 
-* `constant`: the same class probabilities everywhere, (count + 1/2) / (n + C/2) of the others' answers;
-* `quadratic`: an ordinal probit, quadratic in the parameters, one for all people; its slopes have a prior N(0, 3^2) in
-  units of the noise and of the parameters' standard deviations, so that it exists where answers are separated.
+- `constant`: the same class probabilities everywhere, (count + 1/2) / (n + C/2) of the others' responses;
+- `quadratic`: an ordinal probit, quadratic in the parameters, one for all participants; its slopes have a prior N(0,
+  3^2) in units of the noise and of the parameters' standard deviations, so that it exists for separated responses.
 """
 
 import numpy as np
@@ -15,7 +15,9 @@ _SLOPE_SD, _GAP_SD = 3.0, 1.5
 
 
 def constant(q: Int[np.ndarray, " n"], categories: int, observed: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "n C"]:
-    """Class probabilities (n, C) from the answers q (n,) that are `observed` (n,)."""
+    """Class probabilities (n, C), equal in all rows, from the categories `q` (n,) of the rows that are `observed`
+    (n,).
+    """
     counts = np.bincount(q[observed], minlength=categories) + 0.5
     return np.tile(counts / counts.sum(), (len(q), 1))
 
@@ -23,7 +25,11 @@ def constant(q: Int[np.ndarray, " n"], categories: int, observed: Bool[np.ndarra
 def quadratic(
     x: Float[np.ndarray, "n d"], q: Int[np.ndarray, " n"], categories: int, observed: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n C"]:
-    """Class probabilities (n, C) at points x (n, d), from the answers that are `observed` (n,)."""
+    """Class probabilities (n, C) at points `x` (n, d), fitted to the responses `q` of the rows that are `observed`
+    (n,).
+
+    The end of the optimiser is taken, converged or not.
+    """
     from scipy.optimize import minimize
 
     spread = x[observed].std(axis=0)
@@ -54,14 +60,18 @@ def quadratic(
 
 
 def _edges(w: Float[np.ndarray, " edges"]) -> Float[np.ndarray, " bounds"]:
-    """Thresholds from the first one and the logarithms of the gaps, between minus and plus infinity."""
+    """Edges (C + 1,): minus infinity, the thresholds, infinity; `w` (C - 1,): first threshold and log gaps."""
     return np.concatenate([[-np.inf], np.cumsum(np.concatenate([w[:1], np.exp(w[1:])])), [np.inf]])
 
 
 def _log_masses(
     level: Float[np.ndarray, " n"], edges: Float[np.ndarray, " bounds"], q: Int[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """log P(q) of levels with noise 1, and its derivatives in the lower and the upper edge; from the smaller tails."""
+    """Log P(q) at latent values `level` (n,) with noise 1, and its derivatives in the lower and the upper edge, (n,)
+    each.
+
+    Computed from the smaller tails.
+    """
     low, high = edges[q] - level, edges[q + 1] - level
     above = low > 0  # then the same mass mirrored lies in the lower tail
     a, b = np.where(above, -high, low), np.where(above, -low, high)

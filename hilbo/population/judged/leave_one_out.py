@@ -1,18 +1,19 @@
-"""Each person left out once: what a rule predicts of their answers, and how far that can be trusted.
+"""Leave-one-participant-out cross-validation: prediction of a participant's responses, and its calibration.
 
-Each answer is predicted from the others' answers and from the person's own earlier ones. A session chooses renderings
-by these: predicted without them, "close" is given too often where it was asked for again, though the model is right.
+Each response is predicted from the other participants' responses and from the participant's own earlier ones. A session
+chooses stimuli by these: predicted without them, "close" is given too often where it was tested again, though the model
+is right.
 
-From the class probabilities of held-out answers come
+From the class probabilities of held-out responses come
 
-* the negative log predictive density, and the influence of each person: what leaving that person out does to a map;
-* the randomised probability integral transform u = F(q - 1) + v (F(q) - F(q - 1)), v uniform: uniform on [0, 1] for a
-  calibrated prediction, so that 95 % of the u lie in the central 95 %;
-* z^2, the mean squared normal score Phi^-1(u), 1 for a calibrated prediction, more for one that is too sure;
-* reliability: in bins of the predicted probability of a category, how often it was chosen.
+- the negative log predictive density, and the influence of each participant: the change of the map without them;
+- the randomised probability integral transform u = F(q - 1) + v (F(q) - F(q - 1)), v uniform: uniform on [0, 1] for a
+  calibrated prediction, so that 95 % of the u are in the central 95 %;
+- z^2, the mean squared normal score Phi^-1(u), 1 for a calibrated prediction, more for an overconfident one;
+- reliability: in bins of the predicted probability of a category, its observed frequency.
 
-Answers of one person are not independent: errors are clustered by person.
-Reference: Czado, Gneiting & Held (2009), Biometrics 65:1254, for the transform of discrete data.
+Responses of one participant are not independent: errors are clustered by participant. Reference: Czado, Gneiting & Held
+(2009), Biometrics 65:1254, for the transform of discrete data.
 """
 
 import dataclasses
@@ -53,8 +54,12 @@ __all__ = [
 
 @dataclasses.dataclass(frozen=True)
 class LeftOut:
-    """Predictions of everybody's answers, each from all others' answers and the person's own earlier ones
-    (`newcomer.predicted_in_turn`), one row for each answer."""
+    """Predictions of all responses, each from the other participants' and the participant's own earlier ones
+    (`newcomer.predicted_in_turn`), one row for each response.
+
+    `person` (n,): row of the participant; `q` (n,): category; `probabilities` (n, C); `not_converged`: number of folds
+    in which a fit did not converge.
+    """
 
     person: Int[np.ndarray, " n"]
     q: Int[np.ndarray, " n"]
@@ -66,14 +71,14 @@ class LeftOut:
 
     @property
     def cost(self) -> Float[np.ndarray, " n"]:
-        """Negative log predictive density of each answer."""
+        """Negative log predictive density of each response, (n,), in nats."""
         if self.log_given is None:
             return -np.log(self.probabilities[np.arange(len(self.q)), self.q])
         return -self.log_given
 
 
 def without(trials: Trials, left: int | Int[np.ndarray, " k"]) -> Trials:
-    """Stacked trials without some people."""
+    """Copy of stacked trials without the participants in the rows `left`."""
     rows = np.delete(np.arange(trials.mask.shape[0]), left)
     return rows_of(trials, rows)
 
@@ -88,8 +93,13 @@ def leave_one_out(
     inference: str = "laplace",
     groups: Sequence[Int[np.ndarray, " _"]] | None = None,
 ) -> tuple[LeftOut, list[RuleMap]]:
-    """What a rule predicts of each person's answers from all others' and their own earlier ones (hyperparameters and
-    share as given); and the maps without them; errors as in [`left_out_by`][]."""
+    """Predict each participant's responses without their data, by an aggregation method with fixed hyperparameters.
+
+    **Arguments:** `share`: of the hierarchical method, None: learnt in each fold; `posteriors`: the individual ones of
+    all participants, if known; `groups`: as for [`left_out_by`][].
+
+    **Returns:** the predictions, and the map of each fold. Raises `InputError` as `left_out_by` and `rule_map`.
+    """
 
     def fold(left: Int[np.ndarray, " k"]) -> tuple[OrdinalGP, RuleMap]:
         rest = np.delete(np.arange(trials.mask.shape[0]), left)
@@ -108,10 +118,10 @@ def leave_one_out_learnt(
     again: bool = True,
     groups: Sequence[Int[np.ndarray, " _"]] | None = None,
 ) -> tuple[LeftOut, list[RuleMap]]:
-    """The same by a recipe that learns, from what was learnt of everybody's answers.
+    """`leave_one_out` by a versioned method that learns the hyperparameters; `learnt`: from all responses.
 
-    **Arguments:** `stated`: what the study states; `again`: whether the hyperparameters are learnt again in each fold;
-    else those of all answers are kept, those of the person left out among them.
+    **Arguments:** `stated`: hyperparameters specified by the study; `again`: whether the others are learnt again in
+    each fold; else those from all responses are used, including those of the participant left out.
     """
     categories = learnt.model.thresholds.shape[0] + 1
 
@@ -128,8 +138,14 @@ def left_out_by(
     fold: Callable[[Int[np.ndarray, " k"]], tuple[OrdinalGP, RuleMap]],
     groups: Sequence[Int[np.ndarray, " _"]] | None = None,
 ) -> tuple[LeftOut, list[RuleMap]]:
-    """What `fold` predicts of people: the model and the map without those in some rows of the trials; each alone, or in
-    `groups`. Raises InputError for fewer than three people: two must be left to differ."""
+    """Predict participants' responses by models that were fitted without them.
+
+    **Arguments:** `trials`: stacked; `fold`: takes rows (k,) and returns model and map without these participants;
+    `groups`: rows that are left out together, default: each participant alone.
+
+    **Returns:** the predictions, and the map of each fold, in order. Raises `InputError` for fewer than three
+    participants.
+    """
     people = trials.mask.shape[0]
     if people < 3:
         raise InputError(f"leave_one_out: {people} people; at least three are needed, of whom two are left each time.")
@@ -151,7 +167,9 @@ def left_out_by(
 
 
 def influence(whole: RuleMap, parts: list[RuleMap], x: Float[Array, "m d"]) -> Float[np.ndarray, " M"]:
-    """Root mean square change of the map's mean at x, in its standard deviations, when each person is left out."""
+    """Root mean square change of the map's mean over points (m, d), in the whole map's standard deviations, for each of
+    `parts`, the maps without one participant each.
+    """
     mean, variance = _predict(whole, x)
     moved = [_predict(map_without, x)[0] - mean for map_without in parts]
     return np.array([float(jnp.sqrt(jnp.mean(move**2 / variance))) for move in moved])
@@ -160,7 +178,9 @@ def influence(whole: RuleMap, parts: list[RuleMap], x: Float[Array, "m d"]) -> F
 def integral_transform(
     probabilities: Float[np.ndarray, "n C"], q: Int[np.ndarray, " n"], seed: int = 0
 ) -> Float[np.ndarray, " n"]:
-    """The randomised probability integral transform of answers q, (n,)."""
+    """Randomised probability integral transform (n,) of categories `q` (n,), in [0, 1]; `seed`: of the
+    randomisation.
+    """
     n = np.arange(len(q))
     chance = probabilities[n, q]
     below = np.cumsum(probabilities, axis=1)[n, q] - chance
@@ -170,7 +190,9 @@ def integral_transform(
 def normal_scores(
     probabilities: Float[np.ndarray, "n C"], q: Int[np.ndarray, " n"], seed: int = 0
 ) -> Float[np.ndarray, " n"]:
-    """Normal scores of the transform (n,), each from the smaller of its tails: finite in both."""
+    """Normal scores Phi^-1(u) (n,) of the transform, each from the smaller of its tails, so that large ones stay
+    finite.
+    """
     n, v = np.arange(len(q)), np.random.default_rng(seed).uniform(size=len(q))
     chance = probabilities[n, q]
     ranks = np.arange(probabilities.shape[1])[None, :]
@@ -181,7 +203,9 @@ def normal_scores(
 
 
 def clustered(values: Float[np.ndarray, " n"], person: Int[np.ndarray, " n"]) -> tuple[float, float]:
-    """Mean of values, and its standard error where values of one person go together."""
+    """Mean of values (n,), and its standard error with clusters by `person` (n,); the error is NaN for one
+    participant.
+    """
     mean, people = values.mean(), np.unique(person)
     sums = np.array([np.sum(values[person == p] - mean) for p in people])
     if len(people) < 2:
@@ -190,7 +214,9 @@ def clustered(values: Float[np.ndarray, " n"], person: Int[np.ndarray, " n"]) ->
 
 
 def calibration(left: LeftOut, seed: int = 0) -> dict[str, float]:
-    """Mean cost, share in the central 95 % and z^2, each with its error by person."""
+    """Mean cost (`negative_log_density`), share in the central 95 % (`central_95`) and `z2`; and the standard error of
+    each, clustered by participant, under NAME_error.
+    """
     u = integral_transform(left.probabilities, left.q, seed)
     parts = {
         "negative_log_density": left.cost,
@@ -204,7 +230,9 @@ def calibration(left: LeftOut, seed: int = 0) -> dict[str, float]:
 
 
 def reliability(left: LeftOut, bins: int = 10) -> list[dict[str, float]]:
-    """Predicted against observed: in bins of the probability of a category, over all answers and categories."""
+    """Calibration curve: for each non-empty bin of the predicted probability of a category, over all responses and
+    categories, mean predicted probability, observed frequency and count.
+    """
     chance = left.probabilities.ravel()
     chosen = (left.q[:, None] == np.arange(left.probabilities.shape[1])[None, :]).ravel()
     place = np.minimum((chance * bins).astype(int), bins - 1)
@@ -221,6 +249,7 @@ def reliability(left: LeftOut, bins: int = 10) -> list[dict[str, float]]:
 
 @program
 def _predict(population_map: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Mean and variance (m,) of a map at points (m, d)."""
     return population_map.predict(x)
 
 
@@ -233,8 +262,11 @@ def _newcomer(
     mask: Bool[Array, " m"],
     context: Int[Array, " m"] | None,
 ) -> InTurn:
-    """A new person's answers, one after the other. Their function has the map's mean and variance, and the kernel's
-    correlation; answers in one context of a random effect have what it adds in common."""
+    """Predict a new participant's responses `q` (m,) at points (m, d), one after the other.
+
+    The participant's function has the map's mean and variance, and the kernel's correlation; responses in one context
+    of a random effect have its effect in common. `mask` (m,): False in rows without a response.
+    """
     mean, variance = population_map.newcomer(x, context)
     correlation, effects = _correlation(gram(gp.kernel, x, x)), population_map.effects
     if effects is not None and context is not None:
@@ -247,12 +279,13 @@ def _newcomer(
 
 
 def _correlation(covariance: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """Correlation matrix (m, m) of a covariance matrix."""
     sd = jnp.sqrt(jnp.diagonal(covariance))
     return covariance / jnp.outer(sd, sd)
 
 
 def _converged(map_: RuleMap) -> bool:
-    """Whether every fit behind a map held its certificate."""
+    """Whether all fits behind a map have converged."""
     fits = map_.experts if map_.shared is None else map_.shared
     assert fits is not None
     return bool(np.all(np.asarray(fits.certificate.converged)))

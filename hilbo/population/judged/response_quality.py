@@ -1,25 +1,25 @@
-"""How well people answer: test-retest consistency, lapse rate and drift of criterion, each with an interval.
+"""Response quality: test-retest consistency, lapse rate and drift of criterion, each with an interval.
 
-Consistency needs no model: a person's answers to (nearly) the same rendering are paired, each answer once, and the
-share of pairs that agree has an exact interval. Beside it stands the agreement by chance that the shares of the paired
-answers would give. A session that chooses its own trials returns to promising places only, not to clear ones.
+Consistency needs no model: a participant's responses to (nearly) the same stimulus are paired, each response once, and
+the share of pairs that agree has an exact interval. The agreement expected by chance, from the proportions of the
+paired responses, is next to it. A session that chooses its own trials repeats promising stimuli only, not clear ones.
 
-The other two are from the likelihood of a person's answers in turn: each is predicted from those before it, by a model
-of that person alone (`newcomer.in_turn`). A session asks again where an answer was "close". An answer and those after
-it then depend on each other through what was asked, and only the order in which they were given makes a likelihood. The
-lapse rate l is the share of answers that are any category at random; drift d is a shift of the latent score from the
-first trial to the last, in prior standard deviations (negative: stricter): d (s - 1/2) where the share s of the session
-is over. The model's prior has a constant of variance 4 k added: the level of a person's answers is their own affair,
-and an answer far from all others is expected to be like them, not like the prior's mean. Noise beyond the model's looks
-like lapses: a rate says how much of the answers the person's own model cannot tell from chance.
+The other two are from the likelihood of a participant's responses in sequence: each is predicted from the earlier ones,
+by a model of that participant alone (`newcomer.in_turn`). A session tests again where a response was "close". A
+response and the later ones are then dependent through the choice of stimuli, and only the order in which they were
+given makes a likelihood. The lapse rate l is the share of responses that are any category at random; drift d is a shift
+of the latent score from the first trial to the last, in prior standard deviations (negative: stricter): d (s - 1/2) at
+the fraction s of the session. The model's prior has a constant of variance 4 k added: the level of a participant's
+responses is individual, and a response far from all others is expected to be like them, not like the prior's mean.
+Noise beyond the model's resembles lapses: the rate is the part of the responses that the participant's own model cannot
+distinguish from chance.
 
-The likelihood is known on a grid of rates and drifts. Each estimate is where it is largest, the other being the
-likeliest then, and intervals are where twice its logarithm falls by less than 3.84. Where an interval has no end the
-answers do not tell, and there is no estimate. The filter and that quantile are approximate;
-`benchmarks/coverage_people.py` measures how often intervals hold.
+The likelihood is computed on a grid of rates and drifts. Each estimate is the maximum of its profile likelihood, and
+intervals are where twice the log profile falls by less than 3.84. Where an interval has no end there is no estimate.
+The filter and that quantile are approximate; `benchmarks/coverage_people.py` measures the coverage of the intervals.
 
-An exclusion rule, "trials < 10 or lapse_low > 0.3", speaks of a person's own answers only, and is applied before
-anything is aggregated.
+An exclusion rule, "trials < 10 or lapse_low > 0.3", uses a participant's own responses only, and is applied before
+aggregation.
 """
 
 import re
@@ -72,23 +72,25 @@ _RULE = re.compile(r"^\s*(\w+)\s*(<=|>=|<|>)\s*([-+0-9.eE]+)\s*$")
 
 
 class _Levelled(eqx.Module):
-    """A kernel and a constant of unknown height."""
+    """A kernel plus a constant with 4 times its variance: functions of unknown level."""
 
     kernel: Kernel
 
     def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
+        """Covariance of the latent function at `x` and `y`, both (d,); a scalar."""
         return self.kernel(x, y) + _LEVEL * self.kernel.diagonal(x)
 
     def diagonal(self, x: Float[Array, " d"]) -> Float[Array, ""]:
+        """Prior variance at `x` (d,); a scalar."""
         return (1 + _LEVEL) * self.kernel.diagonal(x)
 
 
 def measure_people(gp: OrdinalGP, trials: Trials, names: tuple[str, ...], *, near: float = _NEAR) -> pd.DataFrame:
-    """One row for each person of stacked trials (M, n) in the order in which they were answered: `participant` and
-    `MEASURES`.
+    """Measures of response quality: one row for each participant, `participant` (of `names`) and `MEASURES`.
 
-    `surprise` is the mean of -log p of an answer, in nats, p being the person's own model's that was told of the
-    earlier ones; what cannot be said is NaN. Of more than 200 answers of a person so many are chosen, evenly, for
+    `trials`: stacked (M, n), in the order of the responses; `near`: NRMSE up to which stimuli count as repeated.
+    `surprise` is the mean of -log p of a response, in nats, predicted by the participant's own model from the earlier
+    ones. What is not known is NaN. Of more than 200 responses of a participant, 200 evenly spaced ones are used for
     lapse, drift and surprise.
     """
     model = OrdinalGP(_Levelled(gp.kernel), gp.likelihood)
@@ -108,7 +110,7 @@ def measure_people(gp: OrdinalGP, trials: Trials, names: tuple[str, ...], *, nea
 
 
 def _evenly(trials: Trials) -> Trials:
-    """At most `_MOST` answers of each person, evenly chosen, in their order."""
+    """Stacked trials with at most 200 responses of each participant, evenly spaced, in their order."""
     mask = np.asarray(trials.mask)
     if mask.shape[1] <= _MOST:
         return trials
@@ -123,7 +125,9 @@ def _evenly(trials: Trials) -> Trials:
 
 @program
 def _log_likelihoods(gp: OrdinalGP, trials: Trials, drifts: Float[Array, " shifts"]) -> Float[Array, "M rates shifts"]:
-    """Of everybody's answers, at each lapse rate and drift, which is in the unit of the latent score."""
+    """Log likelihood of each participant's responses in sequence, at each lapse rate of `_RATES` and each of `drifts`,
+    which are in units of the latent score.
+    """
 
     def person(trials: Trials) -> Float[Array, "rates shifts"]:
         covariance = gram(gp.kernel, trials.x, trials.x)
@@ -141,7 +145,7 @@ def _log_likelihoods(gp: OrdinalGP, trials: Trials, drifts: Float[Array, " shift
 
 
 def repeats(x: Float[np.ndarray, "n d"], near: float = _NEAR) -> np.ndarray:
-    """Disjoint pairs (k, 2) of rows within `near` of each other (NRMSE), nearest first, each row once."""
+    """Disjoint pairs (k, 2) of rows of `x` (n, d) within `near` of each other (NRMSE), nearest first, each row once."""
     distance = np.sqrt(np.mean((x[:, None, :] - x[None, :, :]) ** 2, axis=2))
     rows, columns = np.nonzero(np.triu(distance <= near, 1))
     pairs, used = [], set()
@@ -154,7 +158,10 @@ def repeats(x: Float[np.ndarray, "n d"], near: float = _NEAR) -> np.ndarray:
 
 
 def _lapse(log_likelihood: Float[np.ndarray, "rates shifts"], answers: int) -> tuple[float, float, float]:
-    """Lapse rate and its 95 % interval; NaN where any rate is in it."""
+    """Lapse rate and the ends of its 95 % interval, from the log likelihood over rates and drifts.
+
+    The rate is NaN if the interval is 0 to 1, as it is without `answers` (their number).
+    """
     if not answers:
         return np.nan, 0.0, 1.0
     best, low, high = _profile(_RATES, log_likelihood.max(axis=1))
@@ -162,7 +169,10 @@ def _lapse(log_likelihood: Float[np.ndarray, "rates shifts"], answers: int) -> t
 
 
 def _drift(log_likelihood: Float[np.ndarray, "rates shifts"], answers: int) -> tuple[float, float, float]:
-    """Drift in prior standard deviations and its 95 % interval, open where the grid ends; NaN where it has no end."""
+    """Drift in prior standard deviations and the ends of its 95 % interval, infinite where the grid ends.
+
+    The drift is NaN if both ends are infinite, as they are for fewer than two `answers` (their number).
+    """
     if answers < 2:
         return np.nan, -np.inf, np.inf
     best, low, high = _profile(_DRIFTS, log_likelihood.max(axis=0))
@@ -171,10 +181,11 @@ def _drift(log_likelihood: Float[np.ndarray, "rates shifts"], answers: int) -> t
 
 
 def excluded(table: pd.DataFrame, rule: str) -> dict[str, str]:
-    """Who is left out by a rule, and why: participant -> the condition that holds, with the person's value.
+    """Apply an exclusion rule to a table of `measure_people`: excluded participant -> reason, a text with the first
+    condition that holds and the participant's value.
 
-    A rule is one or more conditions joined by "or"; each names a measure, <, <=, > or >=, and a number. A measure that
-    is NaN fulfils nothing. Raises `InputError` for another rule.
+    A rule is one or more conditions joined by "or"; each has a measure, <, <=, > or >=, and a number; an empty rule
+    excludes nobody. A measure that is NaN fulfils no condition. Raises `InputError` for another rule.
     """
     conditions = [_condition(condition) for condition in rule.split(" or ")] if rule.strip() else []
     reasons = {}
@@ -187,7 +198,10 @@ def excluded(table: pd.DataFrame, rule: str) -> dict[str, str]:
 
 
 def _condition(text: str) -> tuple[str, str, Callable[[float], bool]]:
-    """A condition of a rule: the measure it is about, the condition in words, and whether a value fulfils it."""
+    """Parse one condition of a rule: its measure, the condition as text, and a function that tests a value.
+
+    Raises `InputError` for an unknown measure, or if the text is no condition.
+    """
     matched = _RULE.match(text)
     if matched is None or matched[1] not in MEASURES:
         raise InputError(
@@ -209,7 +223,11 @@ def _condition(text: str) -> tuple[str, str, Callable[[float], bool]]:
 
 
 def _consistency(x: Float[np.ndarray, "n d"], q: Int[np.ndarray, " n"], near: float) -> dict[str, float | int]:
-    """The columns of a person that come from repeated renderings."""
+    """Columns of a participant on repeated stimuli: pairs, consistency with its exact 95 % interval, and agreement by
+    chance.
+
+    `x` (n, d) and `q` (n,): points and categories. Without pairs the values are NaN and the interval 0 to 1.
+    """
     pairs = repeats(x, near)
     row = {"pairs": len(pairs), "consistency": np.nan, "consistency_low": 0.0, "consistency_high": 1.0}
     row["chance"] = np.nan
@@ -222,12 +240,14 @@ def _consistency(x: Float[np.ndarray, "n d"], q: Int[np.ndarray, " n"], near: fl
 
 
 def _estimate_columns(name: str, estimate: tuple[float, float, float]) -> dict[str, float]:
+    """Estimate and interval ends as the columns NAME, NAME_low and NAME_high."""
     return dict(zip((name, f"{name}_low", f"{name}_high"), map(float, estimate), strict=True))
 
 
 def _profile(grid: Float[np.ndarray, " k"], values: Float[np.ndarray, " k"]) -> tuple[float, float, float]:
-    """Where a log likelihood that is known on a grid is largest, and the ends of where twice it is not below by the
-    95 % point of chi^2."""
+    """Maximum of a log likelihood known at the points of a rising `grid` (k,), interpolated; and the ends of its 95 %
+    interval, where twice it falls by the 95 % point of chi^2. An end beyond the grid is the grid's end.
+    """
     between = Akima1DInterpolator(grid, values, method="makima")
     highest = int(np.argmax(values))
     sides = grid[max(highest - 1, 0)], grid[min(highest + 1, len(grid) - 1)]

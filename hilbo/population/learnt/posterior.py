@@ -1,4 +1,4 @@
-"""What a recipe maximises: the log posterior of the hyperparameters with its gradient, in their coordinates."""
+"""Log posterior of the hyperparameters that a recipe maximises, with its gradient, in unconstrained coordinates."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -42,10 +42,10 @@ LEFT = 1e-4
 
 
 class Stated(NamedTuple):
-    """What a study file states of the model; None is learnt.
+    """Hyperparameters that a study file specifies; None is learnt.
 
-    `theta`: of the coordinates that are numbers. `levels`: for each coordinate, None for numbers; nothing where all are
-    numbers. Their correlation stays where theta is stated, and else is the middle of what is believed before answers.
+    `theta`: of the numeric coordinates. `levels`: for each coordinate, None for numeric ones; empty if all are numeric.
+    The levels' correlation is fixed if theta is specified, and else the centre of its prior.
     """
 
     theta: tuple[float, ...] | None = None
@@ -56,12 +56,14 @@ class Stated(NamedTuple):
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What is stated, by its names in [gp]."""
+        """The specified hyperparameters by their names in [gp], without `levels`."""
         return {name: value for name, value in self._asdict().items() if name != "levels" and value is not None}
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """For each coordinate its number of levels, 0 for numbers, as kernels take it."""
+        """For each coordinate its number of levels, 0 for numeric ones, as kernels take it; empty if all are
+        numeric.
+        """
         return tuple(0 if each is None else each.count for each in self.levels)
 
 
@@ -69,7 +71,9 @@ NOTHING = Stated()
 
 
 class Problem(eqx.Module):
-    """What is given of a search."""
+    """Data of a search: counts of responses, specified hyperparameters, priors, kernel, the pivots of the shared
+    function's features, and the `theta` (d,) with which these were chosen.
+    """
 
     answers: Tallies
     stated: Stated = eqx.field(static=True)
@@ -82,7 +86,9 @@ class Problem(eqx.Module):
 
 
 class Cost(NamedTuple):
-    """Minus the log posterior of the hyperparameters and its gradient; and what was seen on the way."""
+    """Minus the log posterior of the hyperparameters and its gradient; log evidence and weights (M, n) at the mode; and
+    whether the fit converged and all is finite (`usable`).
+    """
 
     value: Float[Array, ""]
     gradient: Coordinates
@@ -94,21 +100,24 @@ class Cost(NamedTuple):
 def every_theta(
     kernel: type[Stationary], theta: tuple[float, ...], levels: tuple[Levels | None, ...]
 ) -> tuple[float, ...]:
-    """One theta for each coordinate, from those of the numbers and from the correlations of levels."""
+    """One theta for each coordinate, from those of the numeric coordinates and from the correlations of levels."""
     given = iter(theta)
     return tuple(next(given) if each is None else theta_of(kernel, each.correlation) for each in levels) or theta
 
 
 def prior_model(dim: int, categories: int, stated: Stated = NOTHING) -> OrdinalGP:
-    """One person's model before any answer, by which sessions choose: what is stated, and the medians of the priors,
-    which all recipes have in common, with the RBF."""
+    """One participant's model before any response, which sessions use: the specified hyperparameters, and the medians
+    of the priors, which all recipes have in common, with the RBF. `dim`: number of coordinates.
+    """
     nobody = Tallies(jnp.zeros((1, 1, dim)), jnp.zeros((1, 1, categories)))
     return model_at(medians(nobody, stated, LEARNT_1.priors, RBF), nobody, stated, RBF).gp
 
 
 @program
 def cost_at(coordinates: Coordinates, start: Float[Array, "M n"], problem: Problem) -> Cost:
-    """At some coordinates; `start`: weights near which the mode is sought."""
+    """Cost at the given coordinates; `start` (M, n): weights from which the mode is searched. Never raises: read
+    `usable`.
+    """
 
     def value(coordinates):
         model = model_at(coordinates, problem.answers, problem.stated, problem.kernel)
@@ -121,7 +130,11 @@ def cost_at(coordinates: Coordinates, start: Float[Array, "M n"], problem: Probl
 
 
 def medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior], kernel: type[Stationary]) -> Coordinates:
-    """Where the search begins: the medians of what is learnt."""
+    """Medians of the priors of the hyperparameters that are learnt, by coordinate: the start of the search.
+
+    There is no entry for specified ones, for widths with fewer than three categories, and for an effect without
+    contexts.
+    """
     (people, _, d), categories, dtype = answers.x.shape, answers.counts.shape[-1], answers.x.dtype
     every = {
         "theta": jnp.full(d, priors["theta"].mean, dtype) - _lowered(stated, priors["theta"], kernel, d),
@@ -140,7 +153,11 @@ def medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior], kerne
 
 
 def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated, kernel: type[Stationary]) -> PeopleModel:
-    """The hyperparameters at some coordinates, in units of the stated noise, or variance, or else of a noise of 1."""
+    """Hyperparameters at the given coordinates, completed by the specified ones (`stated`).
+
+    Their unit is the specified noise, or the specified variance, or else a noise of 1. Only the shapes of `answers` are
+    used.
+    """
     (people, _, d), dtype = answers.x.shape, answers.x.dtype
     shared, own = jnp.exp(coordinates["shared"]), jnp.exp(coordinates["own"])
     noise = jnp.asarray(1.0 if stated.noise is None else stated.noise, dtype)
@@ -166,7 +183,7 @@ def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated, kernel:
 
 
 def _log_prior(coordinates: Coordinates, problem: Problem) -> Float[Array, ""]:
-    """Up to a constant."""
+    """Log prior density of the coordinates, up to a constant: a scalar, in nats."""
     d = problem.answers.x.shape[-1]
     total = jnp.zeros((), problem.answers.x.dtype)
     for name, value in coordinates.items():
@@ -177,8 +194,9 @@ def _log_prior(coordinates: Coordinates, problem: Problem) -> Float[Array, ""]:
 
 
 def _lowered(stated: Stated, prior: Prior, kernel: type[Stationary], d: int) -> Float[Array, "*d"]:
-    """By what the prior's mean of log theta is lowered: the logarithm of how many coordinates are numbers; of levels so
-    that its middle is their correlation."""
+    """Amount subtracted from the prior's mean of log theta: the log of the number of numeric coordinates, a scalar;
+    with levels (d,), and for categorical coordinates such that the mean gives their correlation.
+    """
     if not stated.levels:
         return jnp.log(d)
     numbers = sum(each is None for each in stated.levels)

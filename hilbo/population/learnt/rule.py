@@ -1,10 +1,10 @@
-"""The hierarchical model with hyperparameters learnt from all answers, by a recipe of `rules.recipes`.
+"""The hierarchical model with hyperparameters learnt from all responses, by a recipe of `rules.recipes`.
 
-What maximises the Laplace evidence of all answers times the recipe's priors is taken, by L-BFGS from the priors'
-medians, at first with the same widths for all; then with people's own, which are kept if they add 3 or more to the log
-evidence. A hyperparameter that the study states is kept, and with a stated noise, or variance, everything is in its
-unit. The normal approximation of their posterior says how well each is known; one that is known hardly better than
-before the answers is not identified.
+The hyperparameters maximise the Laplace evidence of all responses times the recipe's priors, by L-BFGS from the priors'
+medians, at first with the same widths for all participants; then with individual ones, which are kept if they add 3 or
+more to the log evidence. Hyperparameters that the study specifies are fixed, and with a specified noise, or variance,
+all others are in its unit. Their uncertainty is from a normal approximation of the posterior; one that is hardly
+narrower than its prior is not identified.
 """
 
 from collections.abc import Set
@@ -54,7 +54,9 @@ _WHOLE = 32  # people, up to whom the curvature in all widths is made: a gradien
 
 
 class Learnt(eqx.Module):
-    """Hyperparameters of all people's answers, and how well they are known."""
+    """Hyperparameters learnt from all responses, with a normal approximation of their posterior: `sd` by coordinate,
+    and `covariance` (k, k) without widths. `converged`: the search ended at a maximum with accurate features.
+    """
 
     recipe: str = eqx.field(static=True)
     """Its name."""
@@ -86,13 +88,17 @@ class Learnt(eqx.Module):
 
     @property
     def widths(self) -> bool:
-        """Whether people have widths of their own."""
+        """Whether participants have individual widths of the middle categories."""
         return "widths" in self.coordinates
 
 
 def learnt_function(learnt: Learnt, trials: Trials) -> SharedFunction:
-    """The posterior of the shared function, and of a random effect, by learnt hyperparameters, from stacked trials (M,
-    n): those that were learnt from, or some of them."""
+    """Posterior of the shared function, and of a random effect, with learnt hyperparameters, which are not fitted
+    again.
+
+    `trials`: stacked (M, n), those that were learnt from, or some of them. Never raises for a fit that has not
+    converged.
+    """
     answers = _as_learnt(learnt, trials)
     most = max(LARGEST, min(_MOST_FEATURES, _NUMBERS // answers.blank.size))
     pivots = pivots_for(learnt.model.unit, answers, most=most)
@@ -100,15 +106,16 @@ def learnt_function(learnt: Learnt, trials: Trials) -> SharedFunction:
 
 
 def _as_learnt(learnt: Learnt, trials: Trials) -> Tallies:
-    """Answers with as much room for each person as those that were learnt from."""
+    """Counts of the responses, with as many rows for each participant as those that were learnt from."""
     return tallied(trials, learnt.model.thresholds.size + 1, learnt.weights.shape[1])
 
 
 def drawn_functions(learnt: Learnt, trials: Trials, stated: Stated, seed: int, count: int) -> list[Posterior]:
-    """Posteriors of the shared function by `count` draws of the hyperparameters from their posterior, taken for normal;
-    widths stay as learnt. None where the search ended at no maximum, which that approximation does not describe.
+    """Posteriors of the shared function for `count` draws of the hyperparameters from their normal posterior; widths
+    stay.
 
-    **Arguments:** `trials` and `stated`: those that were learnt from.
+    Draws whose fit does not converge are left out; the list is empty if the covariance is not positive definite, since
+    the search then ended at no maximum. `trials` and `stated`: those that were learnt from.
     """
     covariance = np.asarray(learnt.covariance + learnt.covariance.T) / 2
     if not np.all(np.isfinite(covariance)):
@@ -139,10 +146,12 @@ def learn(
     recipe: Recipe = LEARNT_1,
     near: Learnt | None = None,
 ) -> Learnt:
-    """The hyperparameters of stacked trials (M, n) of answers in `categories`.
+    """Learn the hyperparameters from stacked trials (M, n) with responses in `categories` categories.
 
-    **Arguments:** `stated`: what is kept; `near`: what was learnt by the same recipe from nearly the same answers of as
-    many people, where the search may begin; elsewhere if it cannot. Raises InputError where nobody answered.
+    **Arguments:** `stated`: specified hyperparameters, which are fixed; `near`: result of the same recipe from nearly
+    the same responses of as many participants, where the search starts; if it cannot, it starts at the priors' medians.
+
+    A search that fails does not raise: read `converged`. Raises `InputError` without responses.
     """
     if not np.asarray(trials.mask).any():
         raise InputError(f"{recipe.name}: nobody gave an answer; at least one person's answers are needed.")
@@ -176,7 +185,9 @@ def learn(
 
 
 class _Chosen(NamedTuple):
-    """The search that counts, the problem that it solved, what was free in it, and what widths add to the evidence."""
+    """The search that is used, its problem, the coordinates that were free in it, and the gain of log evidence by
+    individual widths.
+    """
 
     search: Search
     problem: Problem
@@ -185,7 +196,11 @@ class _Chosen(NamedTuple):
 
 
 def _with_widths_if_worth(alike: Search, problem: Problem, coordinates: Set[str]) -> _Chosen:
-    """What is learnt with widths of people's own where they add enough; else `alike`, where all have the same."""
+    """Continue the search `alike`, with equal widths, with individual ones; return it if the log evidence gains more
+    than 3, else `alike`.
+
+    `coordinates`: names of all that are learnt; without "widths" among them nothing is searched, and the gain is 0.
+    """
     without = _Chosen(alike, problem, coordinates - {"widths"}, 0.0)
     if "widths" not in coordinates:
         return without
@@ -198,11 +213,10 @@ def _with_widths_if_worth(alike: Search, problem: Problem, coordinates: Set[str]
 
 
 def _gain_of_widths(alike: Search, different: Search, problem: Problem) -> float:
-    """What widths of people's own add to the log evidence, by Laplace's method with widths that are taken for
-    independent: what stands for each one's curvature is its row of the Hessian added up, as in `_spread`. -inf where
-    the search ended at no maximum by these: the method then says nothing, and nobody has a width.
+    """Gain of log evidence by individual widths, in nats, by Laplace's method with widths that are taken as
+    independent: the row sums of the Hessian replace its diagonal, as in `_spread`.
 
-    **Arguments:** `problem`: of which both costs are.
+    -inf if some curvature is not positive: the search then ended at no maximum. `problem`: of which both costs are.
     """
     widths = different.coordinates["widths"]
 
@@ -218,12 +232,14 @@ def _gain_of_widths(alike: Search, different: Search, problem: Problem) -> float
 
 
 def _spread(search: Search, problem: Problem, free: Set[str]) -> tuple[Coordinates, Float[Array, "k k"]]:
-    """Standard deviations of the posterior of what is `free`, taken for normal, and the covariance without widths: its
-    curvature from differences of gradients with that at the end of the search. Standard deviations are infinite where
-    the curvature says that there is no maximum.
+    """Posterior standard deviations of the `free` coordinates, by a normal approximation, and their covariance (k, k)
+    without widths.
 
-    Widths of many people are taken for independent given the rest. What stands for each one's curvature is then its row
-    of the Hessian added up, which keeps that of all widths together: they may rise where the gaps fall.
+    The curvature is from differences of gradients at the end of the search. A standard deviation is infinite where the
+    variance comes out not positive: then there is no maximum.
+
+    Widths of more than 32 participants are taken as independent given the rest. Each one's curvature is then the row
+    sum of the Hessian, which keeps that of all widths together: they may rise where the gaps fall.
     """
     coordinates, end = search.coordinates, search.cost
     common = {name: value for name, value in coordinates.items() if name in free - {"widths"}}
@@ -257,6 +273,6 @@ def _spread(search: Search, problem: Problem, free: Set[str]) -> tuple[Coordinat
 
 
 def _root_of_diagonal(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, " k"]:
-    """Square roots of the variances, where they are some."""
+    """Standard deviations (k,) of a covariance; infinite where a variance is not positive."""
     variances = np.diagonal(covariance)
     return np.sqrt(np.where(variances > 0, variances, np.inf))

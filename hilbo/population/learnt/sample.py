@@ -1,8 +1,8 @@
-"""Hyperparameters of a large population, learnt from a random sample of people, so that time and memory are bounded.
+"""Hyperparameters of a large population, learnt from a random sample of participants, to bound time and memory.
 
-docs/methods/which_method.md has a table of how far the optimum moves with the size of the sample. The map uses the
-answers of all people. Where the model has individual threshold widths, those of people outside the sample are fitted
-block by block, with the other hyperparameters fixed.
+docs/methods/which_method.md has a table of the shift of the optimum by the size of the sample. The map uses the
+responses of all participants. Where the model has individual threshold widths, those of participants outside the sample
+are fitted block by block, with the other hyperparameters fixed.
 """
 
 import dataclasses
@@ -31,9 +31,10 @@ _FINE = 1e-3  # of the finite difference for the curvature in a width
 def learn_from_sample(
     trials: Trials, categories: int, stated: Stated = NOTHING, recipe: Recipe = LEARNT_1, most: int = SAMPLE
 ) -> Learnt:
-    """Hyperparameters by `recipe`, learnt from a random sample of at most `most` of the people who answered.
+    """Hyperparameters by `recipe`, learnt from a random sample of at most `most` of the participants with responses.
 
-    `trials`: stacked, (M, n). Other arguments and errors are those of `learn`.
+    `trials`: stacked, (M, n). The sample is the same in every call. Weights outside the sample are 0; individual
+    widths, if the model has them, are fitted for everyone. Other arguments and errors are those of `learn`.
     """
     answered = np.flatnonzero(np.asarray(trials.mask).any(axis=1))
     if len(answered) <= most:
@@ -61,7 +62,9 @@ def learn_from_sample(
 
 
 class _Widths(NamedTuple):
-    """Logarithms of people's widths, the standard deviations of their posterior, and whether the search ended there."""
+    """Log widths (M,), their posterior standard deviations (M,), infinite where the curvature is not positive, and
+    whether the search converged.
+    """
 
     log: Float[np.ndarray, " M"]
     sd: Float[np.ndarray, " M"]
@@ -69,8 +72,10 @@ class _Widths(NamedTuple):
 
 
 def _widths(learnt: Learnt, trials: Trials, categories: int, stated: Stated, recipe: Recipe) -> _Widths:
-    """Widths of people outside the sample, with the other hyperparameters of `learnt` fixed. Standard deviations are
-    from the curvature in each width alone, as for many people in `learn`."""
+    """Log widths of participants outside the sample, with the other hyperparameters of `learnt` fixed.
+
+    Standard deviations are from the curvature in each width alone, as for many participants in `learn`.
+    """
     answers = tallied(trials, categories)
     start = learnt.coordinates | {"widths": jnp.zeros(len(trials.mask))}
     pivots = pivots_for(learnt.model.unit, answers, LEFT, most=LARGEST)
@@ -85,5 +90,5 @@ def _widths(learnt: Learnt, trials: Trials, categories: int, stated: Stated, rec
 
 
 def _of(trials: Trials, rows: Int[np.ndarray, " r"]) -> Trials:
-    """Stacked trials of some people."""
+    """Stacked trials of the participants in these rows."""
     return jax.tree.map(lambda leaf: leaf[rows], trials)

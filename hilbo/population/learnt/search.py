@@ -1,4 +1,4 @@
-"""The search for the hyperparameters that maximise what a recipe maximises: L-BFGS on its value and gradient."""
+"""Search for the hyperparameters that maximise a recipe's log posterior, by L-BFGS."""
 
 import dataclasses
 from collections.abc import Set
@@ -27,7 +27,9 @@ _UNITS = {"theta": 0.7, "shared": 0.5, "own": 0.4, "middle": 0.5, "gaps": 0.1, "
 
 
 class Search(NamedTuple):
-    """Where a search is."""
+    """State of a search: coordinates, the cost there, number of L-BFGS steps in all, and whether it converged
+    (`ended`).
+    """
 
     coordinates: Coordinates
     cost: Cost
@@ -37,7 +39,7 @@ class Search(NamedTuple):
 
 
 def first_search(start: Coordinates, answers: Tallies, stated: Stated, recipe: Recipe) -> tuple[Search, Problem]:
-    """A search that has not moved yet, and its problem."""
+    """A search that is still at `start`, with the cost there; and its problem, with pivots for that kernel."""
     model = model_at(start, answers, stated, KERNELS[recipe.kernel])
     pivots = pivots_for(model.unit, answers, LEFT, most=LARGEST)
     problem = Problem(answers, stated, recipe.priors, KERNELS[recipe.kernel], pivots, model.theta)
@@ -45,11 +47,12 @@ def first_search(start: Coordinates, answers: Tallies, stated: Stated, recipe: R
 
 
 def searched(search: Search, problem: Problem, free: Set[str]) -> tuple[Search, Problem]:
-    """The maximum over the coordinates that are `free`, from where a search is, and the problem there.
+    """Maximise the log posterior over the coordinates in `free`, from the state of `search`; return the end and its
+    problem.
 
-    The features stay as they are while it descends, because the cost would jump with others. Where the lengths at its
-    end ask for others, or the descent stopped short, it goes on with those that belong there; after eight descents it
-    has not `ended`.
+    The features stay fixed during a descent, because the cost would jump with others. If the length scales at its end
+    need other features, or the descent stopped early, it is repeated with new ones; after eight descents `ended` is
+    False.
     """
     for _ in range(_ROUNDS):
         search = _descended(search, problem, free)
@@ -65,7 +68,12 @@ def searched(search: Search, problem: Problem, free: Set[str]) -> tuple[Search, 
 
 
 def _descended(search: Search, problem: Problem, free: Set[str]) -> Search:
-    """L-BFGS from where a search is; each mode is sought from the one before's."""
+    """One descent by L-BFGS, at most 100 steps, over the coordinates in `free`; each mode is searched from the previous
+    one.
+
+    Returns the lowest cost met, with the steps added; `ended` is False if a cost was not usable, or L-BFGS did not
+    converge.
+    """
     from scipy.optimize import minimize  # a fifth of a second, which commands that learn nothing need not wait
 
     held = {name: value for name, value in search.coordinates.items() if name not in free}
@@ -107,11 +115,13 @@ def _descended(search: Search, problem: Problem, free: Set[str]) -> Search:
 
 
 class _UnusableError(Exception):
-    """No mode was found there, or no finite slope."""
+    """Raised within a descent where no mode was found, or a gradient is not finite."""
 
 
 def _bounds(begin: Coordinates, problem: Problem) -> list[tuple[float, float]]:
-    """Of the steps from `begin`, in units: those of log theta stay near that by which the features were chosen."""
+    """Bounds (lower, upper) of each coordinate's step from `begin`, in units: log theta stays within 1.5 of the theta
+    with which the features were chosen; others are unbounded.
+    """
     ends = []
     for sign in (-1, 1):
         ways = {name: jnp.full_like(value, sign * jnp.inf) for name, value in begin.items()}

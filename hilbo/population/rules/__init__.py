@@ -1,4 +1,4 @@
-"""The rules of aggregation: their names, what each assumes and needs, and the recipes of those that learn.
+"""The aggregation methods: their names, assumptions and needs, and the recipes of those that learn.
 
-Loads no JAX: study files, the command line and pages ask here too.
+Loads no JAX: study files, the command line and pages use it too.
 """

@@ -26,7 +26,7 @@ __all__ = ["EFFECT", "LEARNT_1", "LEARNT_2", "WIDTHS", "Prior", "Recipe"]
 
 
 class Prior(NamedTuple):
-    """Normal, of one coordinate."""
+    """Normal prior of one coordinate: mean and standard deviation."""
 
     mean: float
     sd: float

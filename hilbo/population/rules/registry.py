@@ -1,8 +1,8 @@
-"""The rules of aggregation: the one list of them, and what is true of each.
+"""The aggregation methods (rules): the only list of them, and their properties.
 
-A rule says how people's answers become one population map and what is taken for its optimum. Study files, `--rule` and
-result.json hold its name; all else that depends on the rule is asked of `RULES[name]`. `hilbo.population.maps` fits the
-maps. A new rule is a new entry here, with its recipe (`recipes`) if it learns the hyperparameters.
+A method combines participants' responses into one population map, and defines its optimum. Study files, `--rule` and
+result.json have its name; all code that depends on the method reads `RULES[name]`. `hilbo.population.maps` fits the
+maps. A new method is a new entry here, with its recipe (`recipes`) if it learns the hyperparameters.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ __all__ = ["DEFAULT", "GIVEN", "POINTWISE", "RECIPES", "RECOMMENDED", "RULES", "
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """A rule of aggregation."""
+    """An aggregation method."""
 
     name: str
     """In study files and results; never changes."""
@@ -55,17 +55,19 @@ class Rule:
 
     @property
     def by_points(self) -> bool:
-        """Whether it is a sum over people at each point."""
+        """Whether it is itself a sum over participants at each point, and not a model of all responses with a
+        stand-in.
+        """
         return self.pointwise == self.name
 
     @property
     def product(self) -> bool:
-        """Whether the map is a product of people's posteriors, which has joint draws."""
+        """Whether the map is a product of the individual posteriors, which has joint draws: of all methods only bcm."""
         return self.by_points and self.weighted and not self.learns_share
 
     @property
     def least_people(self) -> int:
-        """Fewest people with answers."""
+        """Smallest number of participants with responses: 2 if the share is learnt, else 1."""
         return 2 if self.learns_share else 1
 
 

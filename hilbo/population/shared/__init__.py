@@ -1,4 +1,4 @@
-"""The hierarchical model of many people: a shared function, and a function of each person's own.
+"""The hierarchical model of many participants: a shared function, and an individual function of each.
 
 Its exact and its low-rank inference.
 """

@@ -1,9 +1,8 @@
-"""Features of a smooth function that many people share: from few of the answered points the rest follows.
+"""Features of a smooth function that participants share, computed from a few of the tested points (pivots).
 
-With Z the pivots of an incomplete Cholesky factorisation of k at all answered points, L L' = k(Z, Z) and the features
-phi(x) = L^-1 k(Z, x), k(x, y) = phi(x)'phi(y) to an error that the factorisation states. The kernels have the variance
-1 here. Reference: Harbrecht, Peters &
-Schneider (2012), Applied Numerical Mathematics 62:428.
+With Z the pivots of an incomplete Cholesky factorisation of k at all tested points, L L' = k(Z, Z) and the features
+phi(x) = L^-1 k(Z, x), k(x, y) = phi(x)'phi(y) up to an error that the factorisation returns. The kernels have the
+variance 1 here. Reference: Harbrecht, Peters & Schneider (2012), Applied Numerical Mathematics 62:428.
 """
 
 from typing import NamedTuple
@@ -38,7 +37,12 @@ _RANKS = (32, 64, 128, 256, 640, 1024)  # 640: all points of 24 people with 25 a
 
 
 class Pivots(NamedTuple):
-    """Answered points from which the shared function is known."""
+    """Tested points (r, d) from which the shared function is known.
+
+    `used` (r,): False in rows that are padding, or points that the others explain to rounding; `carry` (r,): rows that
+    receive the weights of the responses given there; `left`: largest part of g's prior variance at a tested point that
+    the pivots do not explain.
+    """
 
     points: Float[Array, "r d"]
     used: Bool[Array, " r"]
@@ -51,8 +55,11 @@ class Pivots(NamedTuple):
 def pivots_of(
     kernel: Stationary, answers: Tallies, room: int, tolerance: ArrayLike, most: ArrayLike | None = None
 ) -> Pivots:
-    """Of the points that people were asked at, each where the ones before explain least; no more than there is `room`
-    for, and than `most`."""
+    """Choose pivots among the tested points, each where the earlier ones explain least, until at most `tolerance` of
+    the prior variance is left, or `room` or `most` are chosen.
+
+    Returns a record with `room` rows. Can be traced.
+    """
     x = answers.x.reshape(-1, answers.x.shape[-1])
     rows, left = _chosen(kernel, x, answers.asked.reshape(-1), room, tolerance, most)
     used = rows >= 0
@@ -67,7 +74,11 @@ def _chosen(
     tolerance: ArrayLike,
     most: ArrayLike | None = None,
 ) -> tuple[Int[Array, "{room}"], Float[Array, ""]]:
-    """Rows of the points that are chosen, -1 beyond them; and what they leave."""
+    """Rows of `x` that are chosen as pivots, (room,), -1 after the last; and the largest unexplained part of the
+    variance, a scalar.
+
+    `asked` (N,): which rows are tested points; other arguments as for `pivots_of`.
+    """
     largest = room if most is None else jnp.minimum(room, most)
 
     def going(state):
@@ -93,8 +104,11 @@ _rows_of = program(_chosen)
 def pivots_for(
     kernel: Stationary, answers: Tallies, tolerance: float = TOLERANCE, fewest: int = 0, most: int = _RANKS[-1]
 ) -> Pivots:
-    """The pivots that leave no more than `tolerance`, `most` at most. Their record has one of a few sizes, `fewest` at
-    least: whoever uses it has a program for each size."""
+    """`pivots_of`, with a record of the smallest of a few sizes that holds the pivots and `fewest` rows; compiled
+    functions exist for each size.
+
+    `most`: largest number of pivots, with which more than `tolerance` may be left. Not under `jit`.
+    """
     enough = min(int(np.asarray(answers.asked).sum()), most)
     for room in _ROOMS:
         pivots = _pivots_of(kernel, answers, room, jnp.asarray(tolerance), jnp.asarray(most))
@@ -106,10 +120,11 @@ def pivots_for(
 
 
 def every_point(kernel: Stationary, answers: Tallies) -> Pivots:
-    """All answered points, each once: with these the model is exact. As pivots are used what this precision can tell
-    from the ones before; the others follow, because the posterior's mean takes their answers where they were given.
+    """All distinct tested points as pivots: with these the model is exact.
 
-    The record's size is a multiple of 64, so that nearly as many points have the same programs.
+    `used` are those not explained by the others to rounding, which come first; `carry` are all, since the mean's
+    weights of a response are kept at the point where it was given. The number of rows is a multiple of 64, so that
+    similar numbers of points share compiled functions. Not under `jit`.
     """
     points = np.unique(np.asarray(answers.x)[np.asarray(answers.asked)], axis=0)
     count, room = len(points), _BLOCK * -(-len(points) // _BLOCK)
@@ -121,7 +136,7 @@ def every_point(kernel: Stationary, answers: Tallies) -> Pivots:
 
 
 def _with_room(pivots: Pivots, rank: int) -> Pivots:
-    """With this much room, of which the used ones take less."""
+    """The pivots, used ones first, with `rank` rows, cut or padded with unused rows; `carry` becomes `used`."""
     more = max(rank - len(pivots.used), 0)
     points, used = np.pad(pivots.points[:rank], ((0, more), (0, 0))), np.pad(pivots.used[:rank], (0, more))
     return Pivots(jnp.asarray(points), jnp.asarray(used), jnp.asarray(used), pivots.left)
@@ -129,21 +144,23 @@ def _with_room(pivots: Pivots, rank: int) -> Pivots:
 
 @program
 def unexplained(kernel: Stationary, answers: Tallies, pivots: Pivots) -> Float[Array, ""]:
-    """Largest part of the prior variance of g, at an answered point, that pivots leave, by whatever kernel they were
-    chosen."""
+    """Largest part of the prior variance of g at a tested point that the pivots do not explain, a scalar from 0 to 1.
+
+    `kernel`: may differ from the one with which the pivots were chosen.
+    """
     explained = jnp.sum(features_of(kernel, pivots, answers.x) ** 2, axis=2)
     return jnp.max(jnp.where(answers.asked, 1.0 - explained, 0.0))
 
 
 def root_of_pivots(kernel: Stationary, pivots: Pivots) -> Float[Array, "r r"]:
-    """L, with ones on the diagonal in place of pivots that are not used."""
+    """Lower Cholesky factor L (r, r) of the pivots' covariance, with rows of the unit matrix for unused pivots."""
     both = pivots.used[:, None] & pivots.used[None, :]
     covariance = gram(kernel, pivots.points, pivots.points)
     return jnp.linalg.cholesky(jnp.where(both, covariance, jnp.eye(len(pivots.used), dtype=covariance.dtype)))
 
 
 def features_of(kernel: Stationary, pivots: Pivots, x: Float[Array, "M n d"]) -> Float[Array, "M n r"]:
-    """phi(x)' of everybody's points."""
+    """Features phi(x) of stacked points (M, n, d): (M, n, r), 0 for unused pivots."""
     cross = gram(kernel, pivots.points, x.reshape(-1, x.shape[-1]))
     cross = jnp.where(pivots.used[:, None], cross, 0.0)
     solved = solve_triangular(root_of_pivots(kernel, pivots), cross, lower=True)

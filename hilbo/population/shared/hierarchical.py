@@ -1,14 +1,14 @@
-"""The share of the prior variance that people have in common, and the model in which everybody has a number.
+"""The share of the prior variance that participants have in common, and the model with the participant as a coordinate.
 
     f_j = g + h_j,   cov(g) = p k,   cov(h_j) = (1 - p) k,   so   cov(f_i(x), f_j(y)) = k(x, y) (p + (1 - p) [i = j])
 
-p, the share that people have in common, is learnt by evidence: p = 1 says that all people are one (the pooled model,
-and the committee machine's assumption), p = 0 that nothing is learnt about one person from another.
+The share p is learnt by evidence: p = 1 means that participants do not differ (the pooled model, and the committee
+machine's assumption), p = 0 that one participant's responses carry no information about another.
 
-The model is an ordinal GP like any other, with the person's number as one more coordinate of each point, so that fit,
-evidence and certificate are those of `ordinal_gp`, at a cost that is cubic in the number of answers. Where they are at
-few points, Laplace's evidence and posterior of g are those of `low_rank` with all points as pivots, which is the same
-at a cost that is linear in people; elsewhere it would be several times as slow.
+The model is an ordinal GP like any other, with the participant's number as one more coordinate of each point, so that
+fit, evidence and certificate are those of `ordinal_gp`, at a cost that is cubic in the number of responses. Where they
+are at few points, Laplace's evidence and posterior of g are those of `low_rank` with all points as pivots, which is the
+same at a cost that is linear in participants; elsewhere it would be several times as slow.
 """
 
 import math
@@ -51,7 +51,9 @@ _FINE = 2001
 
 
 class PersonKernel(eqx.Module):
-    """Covariance of people's functions at points (x, person): `kernel` within a person, `share` of it between two."""
+    """Covariance of participants' functions at points (x, participant): `kernel` within one, `share` of it between
+    two.
+    """
 
     kernel: Kernel
     share: Float[Array, ""]
@@ -61,17 +63,22 @@ class PersonKernel(eqx.Module):
         self.share = jnp.asarray(share, jnp.result_type(float) if isinstance(share, float | int) else None)
 
     def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
-        """Covariance of the function of person x[-1] at x[:-1] and of that of person y[-1] at y[:-1]."""
+        """Covariance of the functions of participant x[-1] at x[:-1] and of participant y[-1] at y[:-1], a scalar.
+
+        `x`, `y` (d,): a point and the participant's number.
+        """
         same = x[-1] == y[-1]
         return self.kernel(x[:-1], y[:-1]) * jnp.where(same, jnp.ones_like(x[0]), self.share.astype(x.dtype))
 
     def diagonal(self, x: Float[Array, " d"]) -> Float[Array, ""]:
-        """The prior variance of one person's function. `x` (d,) -> a scalar."""
+        """Prior variance of one participant's function. `x` (d,): a point and the participant's number -> a scalar."""
         return self.kernel.diagonal(x[:-1])
 
 
 class Share(eqx.Module):
-    """What the answers say of the share p; p has a uniform prior on [0, 1]."""
+    """Posterior of the share p, with a uniform prior on [0, 1]: log evidence on a grid of `shares`, mode, mean and
+    central 95 % interval; `converged` if all fits did and the interpolation is accurate.
+    """
 
     shares: Float[Array, " k"]
     """Grid over [0, 1]."""
@@ -99,9 +106,10 @@ class Share(eqx.Module):
 
 
 def of_people(trials: Trials) -> Trials:
-    """One record (sum of answers) from stacked trials (M, n): each point with its person's number, from 0.
+    """One table from stacked trials (M, n): all responses, each at its point with the participant's number, from 0, as
+    a further coordinate.
 
-    Raises `InputError` if nobody gave an answer.
+    Contexts are dropped. Raises `InputError` without responses.
     """
     mask = np.asarray(trials.mask)
     if not mask.any():
@@ -113,8 +121,9 @@ def of_people(trials: Trials) -> Trials:
 
 
 def few_points(trials: Trials) -> bool:
-    """Whether stacked trials (M, n) hold at least three answers for each distinct point: the low-rank model with all
-    points as pivots then costs less than a fit of all answers at once."""
+    """Whether stacked trials (M, n) have at least three responses for each distinct point: then the low-rank model with
+    all points as pivots costs less than one fit of all responses.
+    """
     mask = np.asarray(trials.mask)
     return bool(3 * len(np.unique(np.asarray(trials.x)[mask], axis=0)) <= mask.sum())
 
@@ -122,16 +131,20 @@ def few_points(trials: Trials) -> bool:
 def fit_people(
     gp: OrdinalGP, trials: Trials, share: ArrayLike, *, inference: str = "laplace", throw: bool = True
 ) -> Posterior:
-    """Posterior of everybody's functions, from `of_people(...)`. Predict at points (x, person): a number from 0, or
-    another for a person who gave no answers. Differentiable in `share`."""
+    """Posterior of all participants' functions, from the trials of `of_people`.
+
+    Predict at points (x, participant): a number from 0, or any other for a participant without responses. `share`: in
+    [0, 1]; differentiable in it. Other arguments and errors as for `fit`.
+    """
     model = OrdinalGP(PersonKernel(gp.kernel, share), gp.likelihood)
     return fit(model, trials, inference=inference, throw=throw)
 
 
 def shared_posterior(posterior: Posterior) -> Posterior:
-    """The posterior of g alone, from one of `fit_people` with a stationary kernel: a GP of p times the prior variance.
+    """Posterior of g alone, from one of `fit_people` with a stationary kernel: a GP with p times the prior variance.
 
-    What answers say of g, their weights and C, is what they say of everybody: g's covariance with f_j is p k.
+    The weights and C of the responses stay the same, since the covariance of g with every f_j is p k; the last
+    coordinate of the points is dropped.
     """
     kernel, trials, latent = posterior.gp.kernel, posterior.trials, posterior.latent
     person = kernel.kernel
@@ -142,7 +155,10 @@ def shared_posterior(posterior: Posterior) -> Posterior:
 
 
 def learn_share(gp: OrdinalGP, trials: Trials, inference: str = "laplace") -> Share:
-    """The posterior of the share p from stacked trials (M, n); `gp` is one person's model."""
+    """Posterior of the share p from stacked trials (M, n), by several fits; `gp` is one participant's model.
+
+    Fits that do not converge do not raise: read `converged`. Not under `jit`.
+    """
     if inference == "laplace" and few_points(trials):
         answers = tallied(trials, gp.likelihood.categories)
         return share_from(_by_features(gp, answers), trials.x.dtype)
@@ -151,7 +167,10 @@ def learn_share(gp: OrdinalGP, trials: Trials, inference: str = "laplace") -> Sh
 
 
 def _by_features(gp: OrdinalGP, answers: Tallies) -> Evidence:
-    """By `low_rank`. The mode is sought from where those at the three nearest shares point to."""
+    """Function that computes the log evidence of a share by `low_rank`, and whether the fit converged.
+
+    It remembers its fits: the mode is searched from an extrapolation of those at the three nearest shares.
+    """
     pivots = every_point(PeopleModel.of(gp, 1.0, 0).unit, answers)
     known: dict[float, Float[np.ndarray, "M n"]] = {}
 
@@ -171,6 +190,7 @@ def _by_features(gp: OrdinalGP, answers: Tallies) -> Evidence:
 def _shared_evidence(
     gp: OrdinalGP, answers: Tallies, share: Float[Array, ""], start: Float[Array, "M n"], pivots: Pivots
 ) -> SharedEvidence:
+    """`shared_evidence` of the model with this share; `start` (M, n): weights near the mode."""
     return shared_evidence(PeopleModel.of(gp, share, len(start)), answers, start, pivots)
 
 
@@ -178,17 +198,17 @@ def _shared_evidence(
 def _by_numbers(
     gp: OrdinalGP, trials: Trials, share: Float[Array, ""], inference: str
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Log evidence at one share, from `of_people(...)`, and whether the fit held its certificate."""
+    """Log evidence of one share, from the trials of `of_people`, and whether the fit converged; scalars."""
     posterior = fit_people(gp, trials, share, inference=inference, throw=False)
     return posterior.log_evidence, posterior.certificate.converged
 
 
 def share_from(evidence: Evidence, dtype: DTypeLike) -> Share:
-    """The posterior of the share from its log evidence: a function of a share to its value and whether the fit held.
+    """Posterior of the share from its log evidence: `evidence` takes a share, a scalar, and returns the log evidence in
+    nats and whether the fit converged.
 
-    The evidence is computed at Chebyshev points of [0, 1], 9, 17 or 33 of them, and interpolated: it is smooth in p,
-    and so the whole curve, its maximum and its intervals come at a small cost.
-    `evidence`: scalar -> scalar (nats), and whether it holds.
+    It is called at Chebyshev points of [0, 1], 9, 17 or 33 of them, until the interpolation is accurate. Not under
+    `jit`.
     """
     evaluated: dict[int, tuple[float, bool]] = {}  # by place among the finest nodes, in which the coarser ones are
     for step in (4, 2, 1):
@@ -217,4 +237,5 @@ def share_from(evidence: Evidence, dtype: DTypeLike) -> Share:
 
 
 def _nodes() -> np.ndarray:
+    """The 33 Chebyshev points of [-1, 1], rising."""
     return -np.cos(np.pi * np.arange(_NODES) / (_NODES - 1))

@@ -60,18 +60,24 @@ _STEPS = 100
 
 
 class LowRankPrior(NamedTuple):
-    """K = F F' + blockdiag(K_j)."""
+    """Prior covariance K = F F' + blockdiag(K_j) of all responses' latent values: `features` F (M, n, r) and `blocks`
+    K_j (M, n, n).
+    """
 
     features: Float[Array, "M n r"]
     blocks: Float[Array, "M n n"]
 
     def times(self, weights: Float[Array, "M n"]) -> Float[Array, "M n"]:
-        """K a, and the rows of a sharded as those of K are."""
+        """K a for weights a, (M, n) -> (M, n); the result is sharded over devices as K is."""
         together = jnp.einsum("jnr,jn->r", self.features, weights)
         return sharded(self.features @ together + jnp.einsum("jnm,jm->jn", self.blocks, weights))
 
 
 class System(NamedTuple):
+    """Factors of the matrix of Newton's steps, at curvatures W: W^(1/2), L_j, A_j, S with its Cholesky factor, and log
+    |I + K W|.
+    """
+
     root: Float[Array, "M n"]  # W^(1/2)
     lower: Float[Array, "M n n"]  # L_j
     half: Float[Array, "M n r"]  # A_j
@@ -80,7 +86,7 @@ class System(NamedTuple):
     log_determinant: Float[Array, ""]  # log |I + K W|
 
     def solve(self, right: Float[Array, "M n"]) -> Float[Array, "M n"]:
-        """(K + W^-1)^-1 y, which needs no W^-1."""
+        """(K + W^-1)^-1 y for y (M, n), computed without W^-1; 0 where W is 0."""
         first = _each(lambda p: solve_triangular(p[0], p[1], lower=True), (self.lower, self.root * right))
         together = jax.scipy.linalg.cho_solve((self.factor, True), jnp.einsum("jnr,jn->r", self.half, first))
         rest = first - self.half @ together
@@ -88,7 +94,7 @@ class System(NamedTuple):
 
 
 def _each(function: Callable[..., Any], people: PyTree, *shared: Any) -> Any:
-    """`function(person, *shared)` for all people, one after the other on each device."""
+    """Stacked results of `function(person, *shared)` for each row of `people`, one after the other on each device."""
 
     def some(people, *shared):
         return jax.lax.map(lambda person: function(person, *shared), people)
@@ -97,6 +103,9 @@ def _each(function: Callable[..., Any], people: PyTree, *shared: Any) -> Any:
 
 
 def prior_of(model: PeopleModel, answers: Tallies, pivots: Pivots) -> LowRankPrior:
+    """Prior covariance of the latent values at all points of the responses; contexts of a random effect are features
+    too.
+    """
     unit = of_each_person(lambda x, kernel, pivots: features_of(kernel, pivots, x), answers.x, model.unit, pivots)
 
     def block(person, kernel, own, shared):
@@ -112,6 +121,9 @@ def prior_of(model: PeopleModel, answers: Tallies, pivots: Pivots) -> LowRankPri
 
 
 def system_at(prior: LowRankPrior, curvature: Float[Array, "M n"]) -> System:
+    """Factors of the matrix of Newton's steps at curvatures W >= 0, (M, n); where W is 0 a response has no
+    influence.
+    """
     answered = curvature > 0
     root = jnp.where(answered, jnp.sqrt(jnp.where(answered, curvature, 1.0)), 0.0)
 
@@ -129,7 +141,9 @@ def system_at(prior: LowRankPrior, curvature: Float[Array, "M n"]) -> System:
 
 
 def _expand(model: PeopleModel, answers: Tallies, eta: Float[Array, "M n"]) -> Expansion:
-    """Log-likelihood terms, slopes and curvatures of everybody's answers."""
+    """Log-likelihood terms of all participants' responses, their slopes and curvatures at latent values `eta` (M,
+    n).
+    """
 
     def each(some, noise):
         def person(thresholds, counts, eta):
@@ -144,6 +158,10 @@ def _expand(model: PeopleModel, answers: Tallies, eta: Float[Array, "M n"]) -> E
 
 
 class Mode(NamedTuple):
+    """Weights (M, n) at the mode, residual and its tolerance, and number of steps; converged if residual <=
+    tolerance.
+    """
+
     weights: Float[Array, "M n"]
     residual: Float[Array, ""]
     tolerance: Float[Array, ""]
@@ -158,7 +176,7 @@ class _OfWeights(eqx.Module):
     prior: LowRankPrior
 
     def at(self, weights: Float[Array, "M n"]) -> tuple[PyTree, Expansion]:
-        """The height there, its residual that of `laplace`; and the log-likelihood."""
+        """Height at `weights` (M, n), with the residual as in `laplace`; and the log-likelihood terms there."""
         from hilbo.newton_steps import Height  # imports optimistix, which is slow
 
         prior = self.prior
@@ -178,22 +196,24 @@ class _OfWeights(eqx.Module):
         return height, terms
 
     def towards(self, weights: Float[Array, "M n"], terms: Expansion) -> tuple[Float[Array, "M n"], Float[Array, ""]]:
-        """By the system there."""
+        """Newton step from `weights` (M, n), and the slope of the log posterior along it; `terms` as from `at`."""
         return newton_step(self.prior, system_at(self.prior, terms.curvature), terms.slope - weights)
 
 
 def newton_step(
     prior: LowRankPrior, system: System, off: Float[Array, "M n"]
 ) -> tuple[Float[Array, "M n"], Float[Array, ""]]:
-    """r - (K + W^-1)^-1 K r, r = slope - a: an error of the step is one of r's size; and the rate of ascent along
-    it."""
+    """Newton step r - (K + W^-1)^-1 K r (M, n), and the slope of the log posterior along it, a scalar.
+
+    `off`: r = slope - a, (M, n). In this form an error of the step is relative to the size of r.
+    """
     moved = prior.times(off)
     step = off - system.solve(moved)
     return step, jnp.sum(moved * step)
 
 
 def mode_of(model: PeopleModel, answers: Tallies, prior: LowRankPrior, start: Float[Array, "M n"]) -> Mode:
-    """Damped Newton steps on the weights, from `start`."""
+    """Search for the mode by at most 100 damped Newton steps on the weights, from `start` (M, n). Never raises."""
     from hilbo.newton_steps import climbed  # imports optimistix, which is slow
 
     weights, height, steps = climbed(_OfWeights(model, answers, prior), start, _STEPS)
@@ -201,7 +221,9 @@ def mode_of(model: PeopleModel, answers: Tallies, prior: LowRankPrior, start: Fl
 
 
 class SharedEvidence(NamedTuple):
-    """Laplace's log evidence of all answers, and how it was found."""
+    """Laplace's log evidence of all responses, a scalar in nats; the weights (M, n) at the mode; and whether the search
+    converged.
+    """
 
     value: Float[Array, ""]
     weights: Float[Array, "M n"]
@@ -210,10 +232,10 @@ class SharedEvidence(NamedTuple):
 
 
 def shared_evidence(model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], pivots: Pivots) -> SharedEvidence:
-    """Log evidence of all answers, differentiable once in `model`.
+    """Laplace's log evidence of all responses, differentiable once in `model`. Never raises: read `arrived`.
 
-    **Arguments:** `start`: weights near which the mode is sought; `pivots`: of g, which stay where they are when the
-    model moves. With others the value changes in a small step, which differences and searches must not be taken across.
+    **Arguments:** `start` (M, n): weights from which the mode is searched; `pivots`: of g, constant when the model
+    changes. With other pivots the value changes in a small step, so that differences of values need equal ones.
     """
     still = jax.lax.stop_gradient
     prior = prior_of(model, answers, still(pivots))
@@ -224,7 +246,7 @@ def shared_evidence(model: PeopleModel, answers: Tallies, start: Float[Array, "M
 
 
 class AtWeights(NamedTuple):
-    """The log evidence at some weights; the slopes of the log-likelihood and the system there."""
+    """Log evidence at given weights; slopes (M, n) of the log-likelihood, and the system of Newton's steps there."""
 
     log_evidence: Float[Array, ""]
     slope: Float[Array, "M n"]
@@ -232,7 +254,7 @@ class AtWeights(NamedTuple):
 
 
 def evidence_at(model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]) -> AtWeights:
-    """Laplace's approximation, as if the weights were the mode's."""
+    """Laplace's log evidence with the given `weights` (M, n) in place of the mode's."""
     eta = prior.times(weights)
     terms = _expand(model, answers, eta)
     system = system_at(prior, terms.curvature)
@@ -244,11 +266,15 @@ def evidence_at(model: PeopleModel, answers: Tallies, prior: LowRankPrior, weigh
 def _evidence_at_mode(
     model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]
 ) -> Float[Array, ""]:
-    """`evidence_at` at the mode's weights, which follow model and prior. Differentiable once, in these two."""
+    """Laplace's log evidence at the mode, whose `weights` (M, n) are given. Differentiable once, in model and prior;
+    the derivative takes into account that the mode moves with them.
+    """
     return evidence_at(model, answers, prior, weights).log_evidence
 
 
 def _evidence_forward(model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]):
+    """Log evidence, and what `_evidence_backward` needs."""
+
     def value(*at):
         end = evidence_at(at[0], answers, *at[1:])
         return end.log_evidence, end.system
@@ -258,8 +284,11 @@ def _evidence_forward(model: PeopleModel, answers: Tallies, prior: LowRankPrior,
 
 
 def _evidence_backward(kept, slope: Float[Array, ""]):
-    """The mode solves slope(K a) - a = 0, so that da = (I + W K)^-1 d slope. With g the derivative in the weights, what
-    moves with the mode is (I + K W)^-1 g times d slope, and (I + K W)^-1 = I - K (K + W^-1)^-1."""
+    """Derivatives of the log evidence in model and prior times `slope`; None for the other two arguments.
+
+    The mode solves slope(K a) - a = 0, so that da = (I + W K)^-1 d slope. With g the derivative in the weights, what
+    moves with the mode is (I + K W)^-1 g times d slope, and (I + K W)^-1 = I - K (K + W^-1)^-1.
+    """
     pull, system, model, answers, prior, weights = kept
     of_model, of_prior, of_weights = pull(slope)
     adjoint = of_weights - prior.times(system.solve(of_weights))

@@ -1,5 +1,6 @@
-"""The hyperparameters of the hierarchical model of M people: f_j = g + h_j, with a shared function g and one of each
-person's own, of one kernel; in context c, such as a clip, f_j + u_c."""
+"""Hyperparameters of the hierarchical model of M participants: f_j = g + h_j, with a shared function g and individual
+functions h_j of one kernel; in context c, such as a clip, f_j + u_c.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -35,7 +36,10 @@ class PeopleModel(eqx.Module):
 
     @classmethod
     def of(cls, gp: OrdinalGP, share: ArrayLike, people: int) -> "PeopleModel":
-        """One person's model `gp`, whose prior variance people have in common as far as `share`, in [0, 1], says."""
+        """Hierarchical model from one participant's model `gp`: `share`, in [0, 1], of its prior variance is common.
+
+        All of the `people` participants have its thresholds; no random effect.
+        """
         kernel, likelihood = gp.kernel, gp.likelihood
         share, widths = jnp.asarray(share, kernel.variance.dtype), jnp.zeros(people, kernel.variance.dtype)
         shared, own = share * kernel.variance, (1.0 - share) * kernel.variance
@@ -44,25 +48,25 @@ class PeopleModel(eqx.Module):
 
     @property
     def share(self) -> Float[Array, ""]:
-        """The part of a person's prior variance that all people have in common."""
+        """Part of a participant's prior variance that all have in common, from 0 to 1, a scalar."""
         return self.shared / (self.shared + self.own)
 
     @property
     def gp(self) -> OrdinalGP:
-        """One person's model, with the median widths."""
+        """One participant's model, with the median distances between thresholds; without random effect."""
         return OrdinalGP(self.of_variance(self.shared + self.own), OrdinalProbit(self.thresholds, self.noise))
 
     @property
     def unit(self) -> Stationary:
-        """The kernel with a variance of 1."""
+        """The kernel with variance 1."""
         return self.of_variance(jnp.ones_like(self.shared))
 
     def of_variance(self, variance: Float[Array, ""]) -> Stationary:
-        """The kernel with this variance."""
+        """The kernel with this variance, a scalar."""
         return self.kernel(self.theta, variance, self.levels)
 
     @property
     def person_thresholds(self) -> Float[Array, "M edges"]:
-        """Everybody's thresholds (M, C - 1)."""
+        """Each participant's thresholds (M, C - 1): the common ones, with individual distances from their mean."""
         middle = jnp.mean(self.thresholds)
         return middle + jnp.exp(self.log_widths)[:, None] * (self.thresholds - middle)[None, :]

@@ -1,4 +1,4 @@
-"""What everybody's answers say of the shared function g, and of the random effect of contexts, by `low_rank`."""
+"""Posterior of the shared function g, and of the random effect of contexts, from all responses, by `low_rank`."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,9 @@ __all__ = ["ContextEffects", "SharedFunction", "shared_function"]
 
 
 class ContextEffects(eqx.Module):
-    """The posterior of what each of c contexts adds to everybody's function, and its covariance with g."""
+    """Posterior of the effects of c contexts on all participants' functions: `mean` and `variance` (c,), and their
+    covariance with g; `prior`: variance of an untested context's effect.
+    """
 
     prior: Float[Array, ""]
     """Variance of what a context adds that nobody was asked in."""
@@ -37,13 +39,15 @@ class ContextEffects(eqx.Module):
     """k(x, points) times it is the covariance of g(x) with the effects."""
 
     def added(self, x: Float[Array, "m d"], context: Int[Array, " m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """By what the mean and the variance (m,) of g(x) change in these contexts."""
+        """Changes of mean and variance (m,) of g at points (m, d) when the effects of these contexts are added,
+        `context` (m,) being their indices.
+        """
         together = jnp.sum(gram(self.kernel, x, self.points) * self.cross[:, context].T, axis=1)
         return self.mean[context], self.variance[context] + 2.0 * together
 
 
 class SharedFunction(NamedTuple):
-    """What everybody's answers say."""
+    """Posterior of g, with a random effect integrated out; and the posterior of the effects, None without."""
 
     function: Posterior
     """Of g; a random effect is integrated out."""
@@ -53,13 +57,12 @@ class SharedFunction(NamedTuple):
 
 @program
 def shared_function(model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], pivots: Pivots) -> SharedFunction:
-    """Posterior of the shared function g, as a GP of its prior that was asked at the pivots, and of the random effect;
-    arguments as those of `shared_evidence`.
+    """Posterior of the shared function g, as a GP with tested points at the pivots, and of the random effect.
 
-    What all answers say of g goes through its weights w, of precision S and mean F'a: with L L' = k(Z, Z) the mean is
-    k(x, Z) L^-T w and k(x, Z) L^-T (I - S^-1) L^-1 k(Z, x) of the prior variance is explained. Answers that were given
-    at a pivot weigh there by themselves: L, which may be nearly singular, only carries over the others. Never raises:
-    read `certificate.converged`.
+    Arguments as for `shared_evidence`. All responses together inform g through its weights w, of precision S and mean
+    F'a: with L L' = k(Z, Z) the mean is k(x, Z) L^-T w and k(x, Z) L^-T (I - S^-1) L^-1 k(Z, x) of the prior variance
+    is explained. Weights of responses given at a pivot stay there: L, which may be nearly singular, only carries over
+    the others. Never raises: read `certificate.converged`.
     """
     rank = len(pivots.points)
     prior = prior_of(model, answers, pivots)
@@ -106,7 +109,9 @@ def _weights_at(
     pivots: Pivots,
     root: Float[Array, "r r"],
 ) -> Float[Array, " r"]:
-    """The weights of the pivots, from those of the answers."""
+    """Weights (r,) of the pivots from those of the responses, (M, n): a response at a pivot keeps its own, the others
+    are carried over through their `features`. `root`: L of the shared function's covariance.
+    """
 
     def of_person(person, pivots):
         x, weights, features = person
@@ -125,7 +130,10 @@ def _effects_of(
     points: Float[Array, "r d"],
     root: Float[Array, "r r"],
 ) -> ContextEffects | None:
-    """The weights of g and those of the effect are of the covariance S^-1 and the mean F'a, which is `together`."""
+    """Posterior of the random effect; None if the model has none.
+
+    `together` (p,): posterior mean F'a of the weights of g and, after them, of the effects; their covariance is S^-1.
+    """
     if model.effect is None:
         return None
     rank, sd = len(points), jnp.sqrt(model.effect)
@@ -141,7 +149,7 @@ def _effects_of(
 
 
 def _without_effect(precision: Float[Array, "p p"], rank: int) -> Float[Array, "r r"]:
-    """The precision of the weights of g, those of the effect integrated out."""
+    """Precision (r, r) of the weights of g, with those of the effects integrated out; `rank` is r."""
     if precision.shape[0] == rank:
         return precision
     cross, own = precision[:rank, rank:], precision[rank:, rank:]
@@ -150,7 +158,7 @@ def _without_effect(precision: Float[Array, "p p"], rank: int) -> Float[Array, "
 
 
 def _explained(precision: Float[Array, "r r"], root: Float[Array, "r r"]) -> Float[Array, "r r"]:
-    """V with V'V = L^-T (I - S^-1) L^-1, of S and L."""
+    """V with V'V = L^-T (I - S^-1) L^-1, (r, r), of precision S and root L; negative eigenvalues are taken as 0."""
     excess, vectors = eigh(precision - jnp.eye(root.shape[0], dtype=root.dtype))
     explained = jnp.sqrt(jnp.where(excess > 0, excess / (1.0 + excess), 0.0))  # below 0 by rounding
     return explained[:, None] * solve_triangular(root, vectors, lower=True, trans=1).T
@@ -163,7 +171,10 @@ def _rounding(
     covariance: Float[Array, "r r"],
     of_pivots: Float[Array, " r"],
 ) -> Float[Array, ""]:
-    """What the rounding of everybody's own covariances, and of g's, does to the log evidence."""
+    """Error of the log evidence due to the rounding of the individual covariances and of that of g, a scalar in nats.
+
+    `weights` (M, n): of the responses; `covariance`, `of_pivots`: of the pivots.
+    """
     kernel = model.of_variance(model.own)
 
     def each(people, kernel):

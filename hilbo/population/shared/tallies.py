@@ -1,4 +1,4 @@
-"""Everybody's answers, the repeated ones added up: at one point only how often each category was chosen counts."""
+"""Counts of responses at each distinct point: for repeated stimuli only the counts of the categories matter."""
 
 from functools import partial
 from typing import NamedTuple
@@ -19,7 +19,11 @@ __all__ = ["CountTerms", "Expansion", "Tallies", "expand_counts", "fit_counts", 
 
 
 class Tallies(eqx.Module):
-    """How often each of M people chose each of C categories, at points of their own."""
+    """Counts (M, n, C) of the responses of M participants in C categories, at points (M, n, d) of their own.
+
+    Rows beyond a participant's points have counts 0. `context` (M, n): of each point, as an index; None without a
+    random effect.
+    """
 
     x: Float[Array, "M n d"]
     counts: Float[Array, "M n C"]
@@ -30,19 +34,20 @@ class Tallies(eqx.Module):
 
     @property
     def asked(self) -> Bool[Array, "M n"]:
-        """Where a person gave an answer."""
+        """Mask (M, n) of rows with at least one response."""
         return jnp.sum(self.counts, axis=-1) > 0
 
     @property
     def blank(self) -> Float[Array, "M n"]:
-        """A zero for each point."""
+        """Zeros (M, n), one for each row: weights that stand for no start."""
         return jnp.zeros(self.x.shape[:2], self.x.dtype)
 
 
 def tallied(trials: Trials, categories: int, room: int = 0) -> Tallies:
-    """Stacked trials (M, n), each person's points once in each context, in the order in which they were first asked.
+    """Counts of stacked trials (M, n): each participant's distinct points (in one context), in the order of their first
+    trial.
 
-    `room`: for how many points at least, for the shapes to be those of other answers.
+    `room`: least number of rows for each participant, so that shapes equal those of other counts. Not under `jit`.
     """
     x, q, mask = (np.asarray(leaf) for leaf in (trials.x, trials.q, trials.mask))
     context = np.zeros(q.shape, np.int32) if trials.context is None else np.asarray(trials.context)
@@ -79,26 +84,31 @@ class Expansion(NamedTuple):
 
 
 class CountTerms(eqx.Module):
-    """Log-likelihood terms of `hilbo.laplace`, of so many answers in each category at each of n points."""
+    """Log-likelihood terms for `hilbo.laplace`, of `counts` (n, C) of responses in each category at n points."""
 
     likelihood: OrdinalProbit
     counts: Float[Array, "n C"]
 
     def __call__(self, eta: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
-        """Values, slopes and curvatures at the latent values."""
+        """Values, slopes and curvatures at the latent values `eta` (n,), (n,) each; 0 without responses."""
         return jax.vmap(partial(expand_counts, self.likelihood))(eta, self.counts)[:3]
 
 
 @program
 def fit_counts(gp: OrdinalGP, x: Float[Array, "n d"], counts: Float[Array, "n C"]) -> Posterior:
-    """Laplace's posterior of one person, as `fit` has it, from how often each category was chosen at n points. Never
-    raises: read `certificate.converged`."""
+    """Laplace posterior of one participant from `counts` (n, C) of responses at points `x` (n, d), equal to that of
+    `fit`.
+
+    The posterior's `trials` have these points, and all categories 0. Never raises: read `certificate.converged`.
+    """
     latent = laplace(gram(gp.kernel, x, x), CountTerms(gp.likelihood, counts))
     return Posterior(gp, Trials(x, jnp.zeros(len(x), jnp.int32), jnp.sum(counts, axis=1) > 0), latent)
 
 
 def expand_counts(likelihood: OrdinalProbit, f: Float[Array, ""], counts: Float[Array, " C"]) -> Expansion:
-    """At one latent value, of so many answers in each category; 0 of none."""
+    """Log-likelihood of `counts` (C,) of responses at one latent value `f`, its derivatives, and the sum of absolute
+    slopes; scalars, 0 without responses.
+    """
     parts = jax.vmap(lambda q: jnp.stack(likelihood.expand(f, q)))(jnp.arange(counts.shape[0]))
     parts = jnp.where(counts[:, None] > 0, counts[:, None] * parts, 0.0)
     value, slope, curvature = jnp.sum(parts, axis=0)
