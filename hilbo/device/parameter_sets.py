@@ -33,18 +33,18 @@ class ParameterSet:
     """Parameter set to be rendered by a device.
 
     K0, K1 in N/mm, B1 in N·s^α/mm, T in s, `force_limit` in N (None: the device's own). `memory`: "short", of N
-    samples, or "full", of `states` exponentials.
+    samples, or "full", of `states` exponentials. Strings such as "5.58" are converted to numbers when the set is sent.
     """
 
-    K0: SupportsFloat
-    K1: SupportsFloat
-    B1: SupportsFloat
-    alpha: SupportsFloat
+    K0: SupportsFloat | str
+    K1: SupportsFloat | str
+    B1: SupportsFloat | str
+    alpha: SupportsFloat | str
     N: int = 101
-    T: SupportsFloat = 1e-3
+    T: SupportsFloat | str = 1e-3
     memory: str = "short"
     states: int = 10
-    force_limit: SupportsFloat | None = None
+    force_limit: SupportsFloat | str | None = None
 
     def messages(self, device: HelloReply) -> list[SetParams | SetStates]:
         """Return the messages that send this set to a device, not yet numbered (`set_id` 0): SET_PARAMS, and for full
@@ -94,7 +94,7 @@ class InForce(NamedTuple):
     crc: int
 
 
-def _number(name: str, value: SupportsFloat) -> float:
+def _number(name: str, value: SupportsFloat | str) -> float:
     """Convert a value to float. Raises `InputError`, in which `name` is the name of the value, if that fails."""
     try:
         return float(value)

@@ -5,9 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from material import FOAM, foam_tests, force, loads, position
+from partly import partly
 
 from hilbo.identification import characterise
-from hilbo.identification.fitting import Test
+from hilbo.identification.fitting import Curve, Fit, Test
 from hilbo.identification.material_tables import read_material
 from hilbo.identification.sampled import Sampled
 from hilbo.identification.sentences import recording
@@ -85,7 +86,7 @@ def test_copies_tell_nothing_about_noise(monkeypatch, apart, ratio):
     time = np.arange(50.0)
     curve = 3 + np.exp(-time / 5)
     test = Test("modulus", time, curve + apart * np.array([[1.0], [-1.0]]))
-    (row,) = characterise._noise(SimpleNamespace(curves=[SimpleNamespace(other_way=None)]), [test])
+    (row,) = characterise._noise(partly(Fit, curves=[partly(Curve, other_way=None)]), [test])
     assert row.get("over_repeat_noise") == (None if ratio is None else pytest.approx(ratio, rel=0.01))
 
 

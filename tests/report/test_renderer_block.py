@@ -1,20 +1,22 @@
 """The [renderer] block that `hilbo identify` writes."""
 
 import tomllib
-from types import SimpleNamespace
 
 import pytest
+from partly import partly
 
-from hilbo.identification.characterise import Estimate
+from hilbo.identification.characterise import Characterisation, Estimate
+from hilbo.identification.fitting import Fit
 from hilbo.identification.sampled import Sampled
 from hilbo.report.material import renderer_block
 
 
 def result(status="identified", **model):
     values = {"K0": -2.9, "K1": 5.7, "B1": 5.9, "alpha": 0.2, "K_eff": 0.44}
-    fit = SimpleNamespace(model=Sampled(**model), parameters=lambda: values)
+    fit = partly(Fit, model=Sampled(**model), parameters=lambda: values)
     estimates = {"K_eff": Estimate(0.44, None, None, status)}
-    return SimpleNamespace(fit=fit, estimates=estimates, minimum_damping=0.7)
+    empty = Characterisation(*[None] * len(Characterisation._fields))
+    return empty._replace(fit=fit, estimates=estimates, minimum_damping=0.7)
 
 
 @pytest.mark.parametrize("status", ["identified", "one-sided", "at bound", "not identifiable"])

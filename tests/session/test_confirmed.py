@@ -1,13 +1,13 @@
 """What a program confirms counts in place of what it was asked for, within the study's tolerance and nowhere else."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import hypothesis.strategies as st
 import msgspec
 import pytest
 from hypothesis import given
 from live import CHOOSER, RAW, SETS, beginning, header
+from partly import partly
 
 from hilbo import Study
 from hilbo.errors import InputError
@@ -200,7 +200,7 @@ def test_confirmed_values_take_the_place_of_no_other_column():
     columns = [f"presented_{side}_{name}" for side in "ab" for name in study.space.names]
     values = {side: dict(zip(study.space.names, (0.1, 0.2, 0.3), strict=True)) for side in "ab"}
     trial = replace(trial, data=trial.data | {"renderings": values}, confirmed={})
-    state = SimpleNamespace(study=study.file, header=header("validation"), trials=[trial])
+    state = partly(LiveSession, study=study.file, header=header("validation"), trials=[trial])
     table = validation_table([state])
     assert [name for name in table if name.startswith("presented_")] == columns
     assert table["set_a"].tolist() == ["D"] and table["class_b"].tolist() == ["similar"]
