@@ -29,7 +29,7 @@ PEOPLE, JUDGES = 24, 2
 SENTENCES = re.compile(r"Traceback|Error:")
 _PICTURE = re.compile(r"base64,[A-Za-z0-9+/=\s]+")
 
-__all__ = ["withdrawal_case"]
+__all__ = ["make_logs", "withdrawal_case"]
 
 
 def withdrawal_case(people: int = PEOPLE, quick: bool = False) -> Callable[[random.Random, int], str]:
@@ -156,7 +156,7 @@ def _make(folder: Path, people: int, quick: bool) -> None:
             consent = ("--consent-time", "2026-05-04T10:00", "--protocol-number", "7")
             _run("participants", "add", "participants.csv", f"P{number:02d}", *consent)
         _run("plan", "study.toml", "--participants", str(people), "--out", "plan.json")
-        _logs(Path("logs"))
+        make_logs(Path("logs"))
         _run("aggregate", "trials.csv", "--study", "study.toml", "--out", "first-map")
         _judged(Path("judges"))
         for command in _commands(quick)[1:]:
@@ -197,7 +197,7 @@ class _Given:
         return {"renderings": {"a": {name: float(row[name]) for name in self.names}}}
 
 
-def _logs(folder: Path) -> None:
+def make_logs(folder: Path) -> None:
     """The trial table's answers as logs of the sessions in which they were given."""
     from hilbo.session.log import actions
     from hilbo.session.log.event_log import EventLog

@@ -137,7 +137,7 @@ def test_results_that_are_being_made_are_waited_for_and_none_begin_meanwhile(who
         assert faults(folder, set(), set(PEOPLE)) == [f"{made.name} stays", ".hilbo.lock stays"]
     with patched_disk():
         Process(lambda: delete_participant(folder, "P02"), 25).run()
-    with pytest.raises(InputError, match="a withdrawal is going on"), new_folder(folder / "map2", lambda: None):
+    with pytest.raises(InputError, match="a withdrawal was interrupted"), new_folder(folder / "map2", lambda: None):
         pass
 
 

@@ -160,7 +160,11 @@ def test_a_folder_is_locked_by_one_and_the_lock_goes(tmp_path):
 def test_no_folder_below_an_interrupted_withdrawal_is_locked(tmp_path):
     (tmp_path / JOURNAL).write_text("{}")
     (tmp_path / "below").mkdir()
-    with pytest.raises(InputError, match="interrupted; wait for it"), locked_folder(tmp_path / "below", 0.02):
-        pass
+    for folder in (tmp_path, tmp_path / "below"):  # at once, although there is patience
+        with pytest.raises(InputError, match="was interrupted there; give its command"), locked_folder(folder, 1e6):
+            pass
     with locked_folder(tmp_path, 0.02, in_withdrawal=True):
-        pass
+        with pytest.raises(InputError, match="a withdrawal is going on there; wait"), locked_folder(folder, 0.02):
+            pass
+        assert names(tmp_path) == [JOURNAL, LOCK, "below"]
+    assert names(tmp_path) == [JOURNAL, "below"]

@@ -67,8 +67,8 @@ def withdrawal_above(folder: Path) -> Path | None:
 def locked_folder(folder: Path, patience: float = _PATIENCE, *, in_withdrawal: bool = False) -> Iterator[None]:
     """Context manager that holds the lock of a folder. `in_withdrawal`: ignore a withdrawal's journal.
 
-    Retries until `patience` (s) is over, then raises InputError if the folder is still locked or in a withdrawal; also
-    raises it if the lock file cannot be opened.
+    Retries until `patience` (s) is over, then raises InputError if the folder is still locked or in a withdrawal; raises
+    it at once if a withdrawal was interrupted there or above, or the lock file cannot be opened.
     """
     folder, deadline = Path(os.path.realpath(folder)), time.monotonic() + patience
     path = folder / LOCK
@@ -82,18 +82,32 @@ def locked_folder(folder: Path, patience: float = _PATIENCE, *, in_withdrawal: b
             break
         if file is not None:
             _release(file, path)
-        if time.monotonic() > deadline:
+        if place is not None and _is_interrupted(place):
             raise InputError(
-                f"{folder}: is being changed by another hilbo; wait until that one is done."
-                if place is None
-                else f"{place}: a withdrawal is going on there or was interrupted; wait for it, or give its command"
-                " (hilbo participants delete) again."
+                f"{place}: a withdrawal was interrupted there; give its command (hilbo participants delete) again"
+                " first."
             )
+        if time.monotonic() > deadline:
+            doing = "is being changed by another hilbo" if place is None else "a withdrawal is going on there"
+            raise InputError(f"{place or folder}: {doing}; wait until that one is done.")
         time.sleep(_PAUSE)
     try:
         yield
     finally:
         _release(file, path)
+
+
+def _is_interrupted(place: Path) -> bool:
+    """Whether the withdrawal that has its journal in this folder was killed: nobody holds the lock."""
+    try:
+        file = held(place / LOCK)
+    except OSError:
+        return False
+    if file is None:
+        return False
+    is_left = (place / JOURNAL).exists()
+    _release(file, place / LOCK)
+    return is_left
 
 
 def _release(file: int, path: Path) -> None:
