@@ -234,6 +234,7 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
         'rule = "rbcm"',
         '37: aggregation.rule is "rbcm", which was withdrawn: it won no comparison;',
     ),
+    ('rule = "bcm"', 'rule = ["bcm"]', '37: aggregation.rule is ["bcm"]; it must be one of "bcm", '),
     ('rule = "bcm"', 'rule = "mean"', '37: aggregation.rule is "mean"; it must be one of "bcm", '),
     ("[aggregation]\n", "[aggregation]\n[aggregation]\n", "37: is not valid TOML (Cannot declare ('aggregation',) "),
     ("high = 0.99", "high = ", "16: is not valid TOML (Invalid value), fix that line."),

@@ -120,3 +120,11 @@ def test_a_table_of_many_columns_is_made_at_once(tmp_path, monkeypatch):
         counts.append(len(put))
         put.clear()
     assert counts[0] == counts[1]
+
+
+@pytest.mark.parametrize("count", ["0", "2.5", "-1", "9" * 400])
+def test_a_number_of_taps_is_a_whole_number_of_at_most_nine_digits(tmp_path, count):
+    path = tmp_path / "sets.csv"
+    path.write_text(f"set_id,u,N\nbest,0.5,{count}\n")
+    with pytest.raises(InputError, match=f'sets.csv:2: N is "{count}"; it must be a whole number'):
+        read_sets(path, ("u",))

@@ -88,13 +88,14 @@ def follow(study: Study, aggregated: Aggregate, seed: int = 0, counts: Sequence[
     """Optima of the aggregate's cohort after fewer trials, with the hyperparameters of `study`. Two numbers of trials
     are computed at a time, in threads.
 
-    `counts`: numbers of trials, ascending; by default about 25, and each participant's last. The longest session is
-    always added, and is not fitted again. Raises `InputError` if the aggregate has no individual optima.
+    `counts`: numbers of trials below the longest session, longer ones are ignored; by default about 25, and each
+    participant's last. The longest session is always added, and is not fitted again. Raises `InputError` if the
+    aggregate has no individual optima.
     """
     cohort = aggregated.cohort
     ends = cohort.counts()
     longest = int(ends.max())
-    asked = _counts(ends) if counts is None else np.unique([*counts, longest])
+    asked = _counts(ends) if counts is None else np.unique([*(count for count in counts if count < longest), longest])
     candidates = search_points(study.space, seed)
 
     split = _splits(len(cohort.names), seed)

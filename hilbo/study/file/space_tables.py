@@ -75,10 +75,10 @@ def _check_complete(raw: Mapping[str, Any]) -> None:
     for name, table in check_table(raw.get("parameters", {}), "parameters").items():
         missing += missing_keys(_kind_of(table), _of_one_kind(table, f"parameters.{name}"), f"parameters.{name}")
     rule = raw.get("aggregation", {}).get("rule", DEFAULT)  # one that is none is refused with its value
-    if rule in WITHDRAWN:
+    if isinstance(rule, str) and rule in WITHDRAWN:
         raise InputError(f"aggregation.rule is {WITHDRAWN[rule]}")
     stated = {"theta" if key == "length" else key for key in raw.get("gp", {})}
-    fixed = rule in GIVEN
+    fixed = isinstance(rule, str) and rule in GIVEN
     unstated = [f"gp.{key}" for key in _LEARNT if fixed and key not in stated]
     hint = f'; rule = "{RECOMMENDED}" in [aggregation] learns what [gp] does not state' if unstated else ""
     check_present([*missing, *unstated], hint)

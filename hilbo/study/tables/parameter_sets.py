@@ -127,7 +127,7 @@ def _value(
     if comma and column in (*_WHOLE, *_NUMBERS, "T", *needs):
         text = without_decimal_comma(text)
     if column in _WHOLE:
-        if not re.fullmatch(r"\d+(\.0*)?", text) or int(float(text)) < 1:
+        if not re.fullmatch(r"\d{1,9}(\.0*)?", text) or int(float(text)) < 1:
             raise InputError(f'{place}: {column} is "{text}"; it must be a whole number from 1.')
         return int(float(text))
     if column not in (*_NUMBERS, "T", *needs):
