@@ -67,8 +67,8 @@ def withdrawal_above(folder: Path) -> Path | None:
 def locked_folder(folder: Path, patience: float = _PATIENCE, *, in_withdrawal: bool = False) -> Iterator[None]:
     """Context manager that holds the lock of a folder. `in_withdrawal`: ignore a withdrawal's journal.
 
-    Retries until `patience` (s) is over, then raises InputError if the folder is still locked or in a withdrawal; raises
-    it at once if a withdrawal was interrupted there or above, or the lock file cannot be opened.
+    Retries until `patience` (s) is over, then raises InputError if the folder is still locked or in a withdrawal;
+    raises it at once if a withdrawal was interrupted there or above, or the lock file cannot be opened.
     """
     folder, deadline = Path(os.path.realpath(folder)), time.monotonic() + patience
     path = folder / LOCK
