@@ -79,7 +79,7 @@ def combine(
     Raises `InputError` for other shapes and for a mask that is not boolean. If the explained variance is known
     directly, [`combine_explained`][] is more precise for weak experts.
     """
-    means, variances, prior = _people(means, "variances", variances, prior_variance)
+    means, variances, prior = _checked_arrays(means, "variances", variances, prior_variance)
     return combine_explained(means, prior[None, :] - variances, prior, mask=mask, throw=throw)
 
 
@@ -88,9 +88,11 @@ def combine_explained(
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Population mean and variance (m,) as [`combine`][], from the explained variances e_j = k - sigma_j^2, (M, m).
 
-    The other arguments and the errors raised are those of `combine`.
+    `prior_variance`: k, a scalar or (m,); `mask` (M,): False for absent participants. Raises `InputError` for other
+    shapes, and with `throw` (under `jit` as a run-time error of equinox) for means that are not finite, for e_j of k or
+    more, and if no positive precision is left; with `throw=False` the result is NaN at those points.
     """
-    means, explained, prior = _people(means, "explained", explained, prior_variance)
+    means, explained, prior = _checked_arrays(means, "explained", explained, prior_variance)
     merged, invalid = _merged(means, explained, prior, _present(mask, means))
     return _raise_if(invalid, merged) if throw else merged
 
@@ -126,7 +128,7 @@ def average(
     `variances` (M, m) over the squared number of participants present in `mask` (M,). Raises `InputError` for other
     shapes or another type of mask, and if no participant is present; if the mask is traced, the average is then NaN.
     """
-    means, variances, _ = _people(means, "variances", variances, 1.0)
+    means, variances, _ = _checked_arrays(means, "variances", variances, 1.0)
     present = _present(mask, means)
     if concrete(present) and not np.any(present):
         raise InputError("bcm: nobody is present; an average needs one participant at least.")
@@ -175,7 +177,7 @@ def _add(left: Evidence, right: Evidence) -> Evidence:
     return jax.tree.map(jnp.add, left, right)
 
 
-def _people(
+def _checked_arrays(
     means: Numbers, name: str, others: Numbers, prior_variance: Numbers
 ) -> tuple[Float[Array, "M m"], Float[Array, "M m"], Float[Array, " m"]]:
     """Check `means`, `others` (called `name` in errors) and the prior variance; return them as arrays of one dtype.

@@ -186,11 +186,11 @@ def climbed(ascent: Ascent, start: Array, max_steps: int) -> tuple[Array, Height
     Returns the best point, of the shape of `start`, its height, and the number of evaluations, the start included.
     Never raises: after `max_steps` evaluations the residual may be above its tolerance.
     """
-    solution = optx.root_find(_same, DampedNewton(), start, ascent, max_steps=max_steps, throw=False)
+    solution = optx.root_find(_unused_function, DampedNewton(), start, ascent, max_steps=max_steps, throw=False)
     return solution.value, solution.state.height, jnp.asarray(solution.stats["num_steps"], jnp.int32)
 
 
-def _same(point: Array, ascent: Ascent) -> Array:
+def _unused_function(point: Array, ascent: Ascent) -> Array:
     """Return `point`. Optimistix needs a function for its root finder; `DampedNewton` ignores it."""
     del ascent
     return point

@@ -93,20 +93,23 @@ class Posterior(eqx.Module):
     def mean(self, x: _PointsLike) -> Float[Array, " m"]:
         """Posterior mean (m,) of f at points (m, d) of the unit cube, without computing the variance.
 
-        Raises `InputError` for points of another shape or not finite; warns of points outside the cube. So do the
-        methods below.
+        Raises `InputError` for points of another shape or not finite; warns of points outside the cube.
         """
         return _mean(self, self._points(x))
 
     def predict(self, x: _PointsLike) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Posterior mean and variance of f, (m,) each, at points (m, d) of the unit cube; errors as `mean`."""
+        """Posterior mean and variance of f, (m,) each, at points (m, d) of the unit cube.
+
+        Raises `InputError` for points of another shape or not finite; warns of points outside the cube.
+        """
         return _predict(self, self._points(x))
 
     def predict_explained(self, x: _PointsLike) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Posterior mean (m,) of f, and the explained variance (m,): prior minus posterior variance, without
         cancellation.
 
-        `x`: points (m, d) of the unit cube; errors as `mean`.
+        `x`: points (m, d) of the unit cube. Raises `InputError` for another shape or values that are not finite; warns
+        of points outside the cube.
         """
         return _mean_and_explained(self, self._points(x))
 

@@ -140,8 +140,8 @@ def largest_K1_beside(model: FOSLS, b: float, *, delay: float = 0.0) -> float:
     """`largest_K1` (N/mm) for the B1, α, memory, T and static stiffness H(1) of a model, on damping `b` (N·s/m).
 
     The model's own K1 enters only through H(1). `inf` where every K1 is passive, 0 where none is. Computed by NumPy if
-    the model's numbers are NumPy's and there is no `delay` (s). Raises `InputError` for even N, and for values out of
-    range.
+    the model's numbers are NumPy's and there is no `delay` (s). Raises `InputError` for even N, for a delay that is not
+    from 0 to T, and unless computed by NumPy for a `b` out of range.
     """
     arguments = model.B1, model.alpha, b, model.dc_gain(), model.T
     if check_delay(delay, model.T):

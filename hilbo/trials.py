@@ -77,8 +77,9 @@ class Trials(eqx.Module):
 
     @classmethod
     def empty(cls, capacity: int, dim: int) -> "Trials":
-        """Trials without responses, with room for `capacity` of them at points of `dim` coordinates. Raises as
-        `from_arrays`.
+        """Trials without responses, with room for `capacity` of them at points of `dim` coordinates.
+
+        Raises `InputError` for a capacity or dimension below 1.
         """
         return cls.from_arrays(np.zeros((0, dim)), np.zeros(0, int), capacity)
 

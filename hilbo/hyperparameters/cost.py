@@ -124,7 +124,7 @@ def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, sta
 
     `start` (n,): weights from which the mode is searched.
     """
-    return laplace_evidence(*_parts(gp, coordinates, trials, start.dtype, OrdinalTerms), start)
+    return laplace_evidence(*_evidence_arguments(gp, coordinates, trials, start.dtype, OrdinalTerms), start)
 
 
 @one_at_a_time
@@ -135,13 +135,13 @@ def person_ep_evidence(
 
     `start`: means and log variances (n,) of the cavities, as for [`ep_evidence`][].
     """
-    return ep_evidence(*_parts(gp, coordinates, trials, start[0].dtype, TiltedTerms), start)
+    return ep_evidence(*_evidence_arguments(gp, coordinates, trials, start[0].dtype, TiltedTerms), start)
 
 
 _Terms = TypeVar("_Terms", OrdinalTerms, TiltedTerms)
 
 
-def _parts(
+def _evidence_arguments(
     gp: OrdinalGP, coordinates: Coordinates, trials: Trials, dtype: DTypeLike, terms: type[_Terms]
 ) -> tuple[
     Callable[[Float[Array, " k"]], Matrix],

@@ -72,7 +72,7 @@ def ep_evidence(
     hessian = _bilinear(weights, precision, variance, moves)
     hessian = hessian.at[: of_terms.size, : of_terms.size].add(jax.jacfwd(jax.jacfwd(explicit))(of_terms))
     hessian = hessian.at[of_terms.size :, of_terms.size :].add(
-        jax.jacfwd(jax.jacfwd(paired))(shape) + _twice(post, slopes)
+        jax.jacfwd(jax.jacfwd(paired))(shape) + _trace_term(post, slopes)
     )
 
     joined = jnp.sum(values + 0.5 * jnp.log1p(variance * precision))
@@ -176,7 +176,7 @@ def _bilinear(weights: Vector, precision: Vector, variance: Vector, moves: _Move
     return 0.5 * (by_terms + by_matrix + (by_terms + by_matrix).T)
 
 
-def _twice(post: Conditioned, slopes: Float[Array, "n n k"]) -> Float[Array, "k k"]:
+def _trace_term(post: Conditioned, slopes: Float[Array, "n n k"]) -> Float[Array, "k k"]:
     """Matrix (k, k) of tr(C K_k C K_j) / 2, a part of the Hessian; `slopes` (n, n, k): the K_k."""
     through = jnp.einsum("ij,jlk->kil", post.inverse, slopes)
     return 0.5 * jnp.einsum("kil,jli->kj", through, through)

@@ -53,7 +53,8 @@ def maximise_judged(
 
     `learn`: names of hyperparameters; `shared`: the same for all participants, else individual ones; `inference`:
     method of the evidence; with another than "laplace" nothing is checked, and the error is 0. Not under `jit`: what is
-    learnt again depends on values. Raises `InputError` as `maximise_evidence`.
+    learnt again depends on values. Raises `InputError` for unknown or no names in `learn`, for variance, noise and
+    thresholds together, and for exact inference.
     """
     settings = (tuple(learn), shared, weak_priors)
     maximum = _learnt(gp, trials, *settings, inference)
@@ -63,7 +64,7 @@ def maximise_judged(
     again = ~(jnp.abs(error) <= TRUSTED)
     if bool(again.any()):
         other = _learnt(gp, trials, *settings, "ep")
-        maximum = jax.tree.map(lambda a, b: jnp.where(_like(again, a), a, b), other, maximum)
+        maximum = jax.tree.map(lambda a, b: jnp.where(_broadcastable(again, a), a, b), other, maximum)
     return Judged(maximum, error, again)
 
 
@@ -81,7 +82,7 @@ def judged_sentences(judged: Judged) -> list[str]:
     ]
 
 
-def _like(flags: Bool[Array, "*M"], leaf: Array) -> Bool[Array, "..."]:
+def _broadcastable(flags: Bool[Array, "*M"], leaf: Array) -> Bool[Array, "..."]:
     """Flags with axes of length 1 appended, so that they broadcast against `leaf`."""
     return flags.reshape(*flags.shape, *(1,) * (leaf.ndim - flags.ndim))
 

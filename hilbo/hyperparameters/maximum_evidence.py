@@ -114,9 +114,11 @@ def maximise_shared_evidence(
     starts: int = 4,
     inference: str = "laplace",
 ) -> MaximumEvidence:
-    """One set of hyperparameters for all participants (`trials` stacked): maximises the sum of their log evidences.
+    """One set of hyperparameters for all participants (`trials` stacked, (M, n)): maximises the sum of their log
+    evidences.
 
-    Arguments as for [`maximise_evidence`][]; raises the same `InputError`s.
+    Arguments as for [`maximise_evidence`][]. Raises `InputError` for unknown or no names in `learn`, for variance,
+    noise and thresholds together, and for an inference without derivatives.
     """
     return _maximise(gp, trials, _Options(_checked(learn, inference), weak_priors, starts, inference))
 
@@ -176,7 +178,7 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence
     # One search after the other: each stops when converged or near the end of an earlier one; its first evaluation
     # evidence is sought from the one before's.
     no_ends = jnp.full((options.starts, nothing.coordinates.size), jnp.nan, nothing.coordinates.dtype)
-    _, ends = jax.lax.scan(ended, (no_ends, nothing), _spread(initial, options.starts))
+    _, ends = jax.lax.scan(ended, (no_ends, nothing), _starting_points(initial, options.starts))
     end = _best(ends, options.starts)
     runaway = end.flat
     for name in sorted(initial.keys() - {"first"}):  # in one order, so that every process makes the same program
@@ -239,7 +241,7 @@ def _row_of_model(starts: int) -> int:
     return (starts - 1) // 2
 
 
-def _spread(initial: Coordinates, starts: int) -> Coordinates:
+def _starting_points(initial: Coordinates, starts: int) -> Coordinates:
     """Starting points, stacked along a first axis: theta times rising powers of 4, noise times rising powers of 1/2,
     the model itself in the middle; other coordinates unchanged.
     """

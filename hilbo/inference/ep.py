@@ -108,7 +108,8 @@ def fixed_point(
 ) -> tuple[Vector, Vector, Found]:
     """Cavity means and variances (n,) at the fixed point, and the record of the search, which may not have converged.
 
-    Arguments as for `find`. Means and variances are differentiable in the arrays of `terms` and in `covariance`.
+    `start`: weights (n,), or None for Laplace's mode; `max_steps`: of each search. Means and variances are
+    differentiable in the arrays of `terms` and in `covariance`.
     """
     return find(terms, covariance, start, max_steps)
 

@@ -115,7 +115,7 @@ def find(
 
 
 class _PointTerms(eqx.Module):
-    """Terms evaluated at cavities of variance 0, as for Laplace's method."""
+    """Terms at given latent values: those of cavities with variance 0, as Laplace's method needs them."""
 
     terms: Tilted
 

@@ -178,8 +178,8 @@ def rule_map(
 
     - `posteriors`: the individual ones, stacked, if they exist; else fitted here where they are needed.
     - `share`: of the hierarchical method, else learnt by `share_of`.
-    - `largest`: exact models are used up to so many latent values; beyond it the hierarchical method combines point by
-      point.
+    - `largest`: exact models are used up to so many latent values; beyond it, and with exact inference, the
+      hierarchical method combines point by point.
 
     Raises `InputError` for a method that is not in `GIVEN`, without responses, for a share that cannot be learnt, and
     for "pooled" with more latent values than `largest`.

@@ -44,9 +44,10 @@ def class_probabilities(
 def log_highest(
     likelihood: OrdinalProbit, mean: Float[Array, " m"], variance: Float[Array, " m"], widths: bool = False
 ) -> Float[Array, " m"]:
-    """Log probability (m,) of the highest category, accurate also where it is small.
+    """Log probability (m,) of the highest category for a new participant, accurate also where it is small.
 
-    Arguments as for `class_probabilities`.
+    `mean`, `variance` (m,): of that participant's function; `widths`: whether the distances between thresholds differ
+    between participants, by the prior of the recipes; they are then integrated out by quadrature with 7 nodes.
     """
     spread = jnp.sqrt(likelihood.noise**2 + variance)
     if not widths:
@@ -111,10 +112,12 @@ def in_turn(
     mask: Bool[Array, " n"],
     lapse: ArrayLike = 0.0,
 ) -> InTurn:
-    """`predicted_in_turn` with fixed thresholds, where the share `lapse` of the responses is any category at random.
+    """Predict n responses one after the other as `predicted_in_turn`, with fixed thresholds, where the share `lapse` of
+    the responses is any category at random.
 
-    Each update then has the moments of a mixture of the updated and the unchanged distribution; an unlikely response
-    changes little. Shapes (n,) and (n, n) as there.
+    `mean` (n,), `covariance` (n, n): of the function before any response; `q` (n,): categories, of which those not in
+    `mask` (n,) change nothing. Each update has the moments of a mixture of the updated and the unchanged distribution,
+    so that an unlikely response changes little.
 
     The change of the covariance is a sum of outer products of rows, one for each response, so that a response costs a
     matrix times a vector.

@@ -53,8 +53,8 @@ class _Sums(NamedTuple):
     ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the population map by the method `rule`.
 
-        `prior` (m,): prior variance; `people`: number of participants, of which only "average" depends; `share`: p, the
-        one with which the sums were made.
+        `prior` (m,): prior variance; `people`: number of participants, used by "average" alone; `share`: p, the one
+        with which the sums were made, used by the others.
         """
         if not RULES[rule].weighted:
             return self.means / people, (prior - self.explained / people) / people

@@ -45,8 +45,8 @@ def figures_of_many(study: Study, aggregate: Aggregate, grid: xr.Dataset) -> tup
 
     figures, best, drawn = {}, np.asarray(aggregate.optimum.x), {}
     if on_grid(study.space):
-        subset = _some(aggregate.cohort)
-        figures["map"] = maps.map_slices(study, _from(grid), best, subset)
+        subset = _even_subset(aggregate.cohort)
+        figures["map"] = maps.map_slices(study, _interpolated(grid), best, subset)
         drawn["participants"] = len(subset.names)
     if aggregate.own is not None and study.space.dim > 1:
         x = np.asarray(aggregate.own.x)
@@ -57,13 +57,13 @@ def figures_of_many(study: Study, aggregate: Aggregate, grid: xr.Dataset) -> tup
     return figures, drawn
 
 
-def _some(cohort: Cohort) -> Cohort:
+def _even_subset(cohort: Cohort) -> Cohort:
     """At most 200 participants of a cohort, evenly spaced in their order."""
     people = len(cohort.names)
     return cohort.rows(np.unique(np.linspace(0, people - 1, min(people, _DRAWN)).round().astype(int)))
 
 
-def _from(grid: xr.Dataset) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+def _interpolated(grid: xr.Dataset) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     """Map interpolated from its grid (cubic): a function of points (m, d) of the unit cube that returns mean and
     variance, (m,) each.
     """

@@ -59,7 +59,7 @@ def identification_result(
         "nrmse": result.nrmse,
         "residuals": result.noise,
         "bootstrap": None if result.bootstrap is None else {k: list(v) for k, v in result.bootstrap.items()},
-        "memory": [_row(row) for row in result.rows],
+        "memory": [_memory_entry(row) for row in result.rows],
         "smallest_N": None if (best := smallest(result.rows)) is None else best.N,
         "passivity": None if result.minimum_damping is None else _passivity(result.minimum_damping, damping),
         "renderer": renderer_block(result, damping) if sampled else None,
@@ -70,7 +70,7 @@ def identification_result(
     return content
 
 
-def _row(row):
+def _memory_entry(row):
     """Entry of `memory` in result.json for the fit with one memory length: N (None: full memory), NRMSE by test,
     set.
     """

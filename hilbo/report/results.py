@@ -178,11 +178,11 @@ def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> Con
     share = dict(zip(study.space.names, percent.tolist(), strict=True))
     if study.space.mechanics is not None:
         share = {"K0": 100 * (target["K0"] - origin["K0"]) / K0_range(study.space)} | share
-    ways = {name: {"by": _way(origin[name], target[name]), "percent": share[name]} for name in target}
+    ways = {name: {"by": _difference(origin[name], target[name]), "percent": share[name]} for name in target}
     return {"nrmse": float(nrmse(x, start, levels)), "moved": ways}
 
 
-def _way(start: float | str, end: float | str) -> float | str:
+def _difference(start: float | str, end: float | str) -> float | str:
     """Difference `end` - `start` of two values; of two levels the text "A to B", or "the same"."""
     if isinstance(start, str) or isinstance(end, str):
         return "the same" if start == end else f"{start} to {end}"

@@ -164,7 +164,7 @@ def learn(
     if near is not None and not bool(begun.cost.usable):
         return learn(trials, categories, stated, recipe)
     search, problem, free, gain = _with_widths_if_worth(*searched(begun, problem, common), frozenset(start))
-    sd, covariance = _spread(search, problem, free)
+    sd, covariance = _posterior_spread(search, problem, free)
     model = model_at(search.coordinates, answers, stated, KERNELS[recipe.kernel])
     left = unexplained(model.unit, answers, problem.pivots)
     return Learnt(
@@ -214,7 +214,7 @@ def _with_widths_if_worth(alike: Search, problem: Problem, coordinates: Set[str]
 
 def _gain_of_widths(alike: Search, different: Search, problem: Problem) -> float:
     """Gain of log evidence by individual widths, in nats, by Laplace's method with widths that are taken as
-    independent: the row sums of the Hessian replace its diagonal, as in `_spread`.
+    independent: the row sums of the Hessian replace its diagonal, as in `_posterior_spread`.
 
     -inf if some curvature is not positive: the search then ended at no maximum. `problem`: of which both costs are.
     """
@@ -231,7 +231,7 @@ def _gain_of_widths(alike: Search, different: Search, problem: Problem) -> float
     return gain - float(np.sum(np.log(problem.priors["widths"].sd * np.sqrt(curvature))))
 
 
-def _spread(search: Search, problem: Problem, free: Set[str]) -> tuple[Coordinates, Float[Array, "k k"]]:
+def _posterior_spread(search: Search, problem: Problem, free: Set[str]) -> tuple[Coordinates, Float[Array, "k k"]]:
     """Posterior standard deviations of the `free` coordinates, by a normal approximation, and their covariance (k, k)
     without widths.
 

@@ -33,8 +33,10 @@ def learn_from_sample(
 ) -> Learnt:
     """Hyperparameters by `recipe`, learnt from a random sample of at most `most` of the participants with responses.
 
-    `trials`: stacked, (M, n). The sample is the same in every call. Weights outside the sample are 0; individual
-    widths, if the model has them, are fitted for everyone. Other arguments and errors are those of `learn`.
+    `trials`: stacked, (M, n), in `categories` categories; `stated`: specified hyperparameters, which are fixed. The
+    sample is the same in every call. Weights outside the sample are 0; individual widths, if the model has them, are
+    fitted for all participants. Raises `InputError` without responses; a search that fails does not raise: read
+    `converged`.
     """
     answered = np.flatnonzero(np.asarray(trials.mask).any(axis=1))
     if len(answered) <= most:

@@ -33,7 +33,7 @@ class Prior(NamedTuple):
 
 
 class Recipe(NamedTuple):
-    """What is learnt from answers, and how."""
+    """Definition of a method that learns the hyperparameters: frozen name, kernel, and priors."""
 
     name: str
     kernel: Literal["rbf", "matern32"]

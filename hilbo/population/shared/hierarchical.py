@@ -134,7 +134,7 @@ def fit_people(
     """Posterior of all participants' functions, from the trials of `of_people`.
 
     Predict at points (x, participant): a number from 0, or any other for a participant without responses. `share`: in
-    [0, 1]; differentiable in it. Other arguments and errors as for `fit`.
+    [0, 1]; differentiable in it. `throw`: raise `InferenceError` if the fit has not converged.
     """
     model = OrdinalGP(PersonKernel(gp.kernel, share), gp.likelihood)
     return fit(model, trials, inference=inference, throw=throw)

@@ -1,24 +1,24 @@
-"""The hierarchical model with a smooth shared function, at a cost that is linear in people.
+"""The hierarchical model with a smooth shared function, at a cost that is linear in participants.
 
-    f_j = g + h_j,   cov(g) = shared k,   cov(h_j) = own k,   an answer of person j by edges of their own
+    f_j = g + h_j,   cov(g) = shared k,   cov(h_j) = own k,   a response of participant j by individual thresholds
 
-A smooth g is known from few points: with Z the pivots of an incomplete Cholesky factorisation of k at all answered
-points, L L' = k(Z, Z) and the features phi(x) = L^-1 k(Z, x), k(x, y) = phi(x)'phi(y) to an error that the
-factorisation states. What is left between two answers of one person is kept, so that only covariances between people
-are approximate. All answers then have the covariance
+A smooth g is known from few points: with Z the pivots of an incomplete Cholesky factorisation of k at all tested
+points, L L' = k(Z, Z) and the features phi(x) = L^-1 k(Z, x), k(x, y) = phi(x)'phi(y) up to an error that the
+factorisation returns. The remainder between two responses of one participant is kept, so that only covariances between
+participants are approximate. All responses then have the covariance
 
     K = F F' + blockdiag(K_j),   F_j = shared^(1/2) phi(x_j)',   K_j = own k(x_j, x_j) + what F_j F_j' lacks,
 
-a random effect u_c of context c, such as the clip, is one more feature, effect^(1/2) where an answer is of it,
+a random effect u_c of context c, such as the clip, is one more feature, effect^(1/2) for responses in that context,
 
 and with W the curvatures, L_j L_j' = I + W_j^(1/2) K_j W_j^(1/2), A_j = L_j^-1 W_j^(1/2) F_j and S = I + sum_j A_j'A_j
-every system is solved by blocks of one person's answers and one of r x r: M n^3 + M n^2 r + M n r^2 + r^3 in place of
-(M n)^3. S is the posterior precision of the weights of g, g(x) = shared^(1/2) phi(x)'w.
+every system is solved by blocks of one participant's responses and one of r x r: M n^3 + M n^2 r + M n r^2 + r^3 in
+place of (M n)^3. S is the posterior precision of the weights of g, g(x) = shared^(1/2) phi(x)'w.
 
-Laplace's method by Newton's steps (`hilbo.newton_steps`). The evidence has exact first derivatives,
-by the implicit function theorem at the mode. References: Rasmussen & Williams (2006), sections 3.4 and 5.5.1;
-Snelson & Ghahramani (2007), AISTATS, for what is kept within a block; Harbrecht, Peters & Schneider (2012), Applied
-Numerical Mathematics 62:428, for the factorisation.
+Laplace's method by Newton's steps (`hilbo.newton_steps`). The evidence has exact first derivatives, by the implicit
+function theorem at the mode. References: Rasmussen & Williams (2006), sections 3.4 and 5.5.1; Snelson & Ghahramani
+(2007), AISTATS, for the exact blocks; Harbrecht, Peters & Schneider (2012), Applied Numerical Mathematics 62:428, for
+the factorisation.
 """
 
 from collections.abc import Callable
@@ -169,7 +169,7 @@ class Mode(NamedTuple):
 
 
 class _OfWeights(eqx.Module):
-    """The log posterior as a function of the weights a, with which the latent values are K a."""
+    """Log posterior as a function of the weights a (M, n), with which the latent values are K a; an `Ascent`."""
 
     model: PeopleModel
     answers: Tallies

@@ -84,7 +84,7 @@ def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"],
     """
     if study.space.dim == 1:
         return _map_curve(study, surface, optimum, cohort)
-    thirds = [None] if study.space.dim == 2 else _levels(study.space.parameters[2], float(optimum[2]))
+    thirds = [None] if study.space.dim == 2 else _slice_values(study.space.parameters[2], float(optimum[2]))
     grids = [grid_slice(study, surface, optimum, third) for third in thirds]
     figure, panels, draw = map_panels(study, grids)
     counts = []
@@ -165,9 +165,9 @@ def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[s
     return figure
 
 
-def _levels(parameter, third):
-    """Three values of the third parameter in the unit cube, sorted: the optimum's (`third`) and one on either side,
-    within the cube.
+def _slice_values(parameter, third):
+    """Three values of the third parameter in the unit cube, sorted: the optimum's (`third`) and one on either side;
+    near the edge of the cube both others on the inner side.
 
     For a categorical parameter up to three of its levels; for other discrete ones the distinct steps, which may be
     fewer.

@@ -64,10 +64,11 @@ def write_figures(figures: Mapping[str, Any], folder: Path) -> dict[str, bytes]:
 
 
 def _give(painter: Connection, left: deque[tuple[str, Any]], folder: Path, written: dict[str, bytes]) -> None:
-    """Send figures from the front of `left` to the second process, one after the other, and put their PNGs into
-    `written`.
+    """Send figures from the front of `left` to the second process, one after the other, and put the PNGs that it could
+    draw into `written`.
 
-    Ends when none are left, or when the process has ended, which is then forgotten.
+    Ends when none are left, or when the process has ended, which is then forgotten; the figure sent last is then
+    missing.
     """
     with contextlib.suppress(IndexError):
         while True:

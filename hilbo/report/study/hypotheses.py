@@ -71,7 +71,9 @@ def _side(one: float, other: float) -> Side:
 
 
 def _largest(row: np.ndarray, place: int) -> Side:
-    """Whether the number at index `place` of a row is larger than all others, as `_side`; equal is inconclusive."""
+    """ "supports" if the number at index `place` of a row is larger than all others, "inconclusive" if it is equal to
+    the largest of them to 1e-9, else "contradicts".
+    """
     return _side(float(row[place]), float(np.delete(row, place).max()))
 
 

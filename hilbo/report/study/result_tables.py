@@ -65,7 +65,7 @@ def tolerance_table(analysis: Analysis) -> pd.DataFrame:
     their ends (paper, section VII).
 
     An interval is NaN where the highest response is not the likeliest at the optimum; `draws_without`: share of
-    resamples without an interval.
+    resamples without an interval, 1 where no resample had one.
     """
     rows = []
     for name, reading in (("fixed", analysis.fixed), ("optimised", analysis.optimised)):
