@@ -121,7 +121,10 @@ def leave_one_out_learnt(
     """`leave_one_out` by a versioned method that learns the hyperparameters; `learnt`: from all responses.
 
     **Arguments:** `stated`: hyperparameters specified by the study; `again`: whether the others are learnt again in
-    each fold; else those from all responses are used, including those of the participant left out.
+    each fold; else those from all responses are used, including those of the participant left out; `groups`: rows that
+    are left out together, default: each participant alone.
+
+    **Returns:** the predictions, and the map of each fold. Raises `InputError` for fewer than three participants.
     """
     categories = learnt.model.thresholds.shape[0] + 1
 

@@ -110,7 +110,9 @@ def measure_people(gp: OrdinalGP, trials: Trials, names: tuple[str, ...], *, nea
 
 
 def _evenly(trials: Trials) -> Trials:
-    """Stacked trials with at most 200 responses of each participant, evenly spaced, in their order."""
+    """Stacked trials with at most 200 responses of each participant, evenly spaced, in their order; then without
+    contexts.
+    """
     mask = np.asarray(trials.mask)
     if mask.shape[1] <= _MOST:
         return trials

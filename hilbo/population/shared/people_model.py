@@ -15,7 +15,9 @@ __all__ = ["PeopleModel"]
 
 
 class PeopleModel(eqx.Module):
-    """The hyperparameters of the hierarchical model of M people."""
+    """Hyperparameters of the hierarchical model of M participants: kernel and its theta, prior variances of the shared
+    and of the individual functions, thresholds, noise, and log widths of each participant's middle categories.
+    """
 
     theta: Float[Array, "*d"]
     """Inverse squared lengths, per squared unit of x; one, or one for each coordinate."""

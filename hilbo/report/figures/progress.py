@@ -86,7 +86,9 @@ def population_convergence(progress: Progress, references: Mapping[str, Float[np
 @styled
 def progress_figure(study: Study, population: CohortResults, truth: Float[np.ndarray, " d"] | None = None) -> Figure:
     """Left: NRMSE of individual and population optima, after each number of trials, to the last ones or to the `truth`
-    (d,) in the unit cube. Right: cumulative responses in the top category. Waits for the progress to be computed.
+    (d,) in the unit cube, if known. Right: cumulative responses in the top category.
+
+    Waits for the progress to be computed. Raises `InputError` if it was not requested.
     """
     progress = population.progress
     trials = progress.counts
