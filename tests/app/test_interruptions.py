@@ -3,15 +3,21 @@
 Whatever it is, nothing is lost, and what was being felt is felt again once somebody presses Begin.
 """
 
+import asyncio
 import os
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 from live_server import Live, ask, refused
 
+from hilbo.app.hub.hub import Hub
+from hilbo.app.hub.interruptions import Interruptions, interrupt
 from hilbo.app.rehearsal.robot import Client
+from hilbo.app.rigs.rig import Snapshot
 from hilbo.app.wire import security, watchers
+from hilbo.session.log.event_log import LogError
 from hilbo.study.file.plan_file import Block, Planned
 
 
@@ -222,3 +228,69 @@ def test_a_network_that_goes_silently_is_noticed_though_the_stream_stays_open(tm
             live.command("pause")
             live.command("resume")
             live.until(lambda v: v["phase"] == "step", live.whole)
+
+
+class Disk:
+    """A hub with nothing but a disk, which takes some time for an event; `full`: how many events it refuses first."""
+
+    alert = "The disk is full."
+
+    def __init__(self, full):
+        self.full, self.written, self.begun = full, [], True
+        self.state = SimpleNamespace(pending=SimpleNamespace(id=1, unfinished=True), trial=lambda _: None, seq=0)
+        self.runner = SimpleNamespace(restart=lambda: None, wake=lambda: None, forget=lambda: None)
+
+    def publish(self):
+        pass
+
+    async def commit(self, make):
+        return await asyncio.shield(asyncio.ensure_future(self._commit(make)))
+
+    async def _commit(self, make):
+        await asyncio.sleep(0.01)
+        self.full -= 1
+        if self.full >= 0:
+            raise LogError("No space left on device.")
+        self.written.append(make if make.__name__ == "repeat" else make(self.state, 0.0).data.get("condition"))
+
+
+def test_a_trial_begins_again_though_the_reason_could_not_be_written():
+    hub = Disk(full=1)
+    asyncio.run(interrupt(hub, "The participant's page is closed."))
+    assert [make.__name__ for make in hub.written] == ["repeat"]
+
+
+@pytest.mark.parametrize("tried", [0.0, 0.005, 0.05], ids=["not yet", "under way", "in vain"])
+def test_what_the_device_did_is_written_once_before_the_session_ends(tried):
+    async def ended(hub):
+        watch = Interruptions(hub)
+        watch.device_changed(Snapshot("LOST", False, "gone"))
+        watch.device_changed(Snapshot("STOPPED", False, None))
+        await asyncio.sleep(tried)
+        await watch.end()
+        await asyncio.sleep(0.05)
+
+    hub = Disk(full=2 if tried > 0.01 else 0)
+    asyncio.run(ended(hub))
+    assert hub.written == ["lost", "ready"]
+
+
+def test_what_the_device_did_and_cannot_be_written_is_said_at_the_end():
+    """Once everything else has ended: the rig, and the threads."""
+    closed = []
+
+    async def ended():
+        disk = Disk(full=9)
+        hub = Hub(SimpleNamespace(before=[], state=disk.state), None, lambda *_: None, tag="tag")
+        hub._loop, hub._rig = asyncio.get_running_loop(), SimpleNamespace(close=lambda: closed.append("rig"))
+        hub._interruptions.hub = disk
+        hub._interruptions.device_changed(Snapshot("LOST", False, "gone"))
+        await asyncio.sleep(0.05)
+        try:
+            await hub.close()
+        finally:
+            closed.append(hub._disk._shutdown)
+
+    with pytest.raises(LogError, match=r'is full. Not in the log: 1 change of the device, the last to "lost"; go on'):
+        asyncio.run(ended())
+    assert closed == ["rig", True]

@@ -118,8 +118,14 @@ class Hub:
 
     async def close(self) -> None:
         """End the session's work: stop watching and presenting, end all streams, close the rig and the hub's threads.
-        The log stays open."""
-        self._interruptions.end()
+        The log stays open. Raises `LogError`, after all that, if the log lacks events of the device."""
+        try:
+            await self._interruptions.end()
+        finally:
+            await self._close()
+
+    async def _close(self) -> None:
+        """`close`, without the end of watching."""
         self.runner.cancel()
         if self._warming is not None:
             self._warming.cancel()

@@ -52,10 +52,20 @@ class Interruptions:
         self._spawn(self._watch("time", self._look))
         self._spawn(self._watch("log", self.hub.check_log))
 
-    def end(self) -> None:
-        """Cancel all watching; device events that are not on the disk are lost."""
-        for task in self._tasks:
-            task.cancel()
+    async def end(self) -> None:
+        """Commit the device events that still wait for the disk, and cancel all watching. Raises `LogError` with how
+        many events are missing in the log, if they cannot be written."""
+        try:
+            await self._write()  # not after `cancel`, which leaves an event that is being written in the queue
+        finally:
+            for task in self._tasks:
+                task.cancel()
+        if self._unwritten:
+            missing = len(self._unwritten)
+            raise LogError(
+                f"{self.hub.alert} Not in the log: {missing} change{'s' * (missing > 1)} of the device, the last to"
+                f' "{self._condition}"; go on with --resume, and void the trial that it interrupted.'
+            )
 
     @property
     def fault(self) -> str | None:
@@ -150,13 +160,13 @@ class Interruptions:
 
 async def interrupt(hub: HubInterface, why: str) -> None:
     """Interrupt the presentation: note `why` in the log, have an unfinished pending trial begin again, and restart the
-    runner, which presents after Begin is pressed. Events that are refused or cannot be written are left out
-    silently."""
+    runner, which presents after Begin is pressed. An event that is refused or cannot be written is left out silently,
+    the other one is written."""
     pending, hub.begun = hub.state.pending, False
-    with contextlib.suppress(InputError, LogError):
-        await hub.commit(lambda state, at: actions.note(state, why, at))
-        if pending is not None and pending.unfinished:
-            await hub.commit(actions.repeat)
+    repeat = [actions.repeat] if pending is not None and pending.unfinished else []
+    for make in (lambda state, at: actions.note(state, why, at), *repeat):
+        with contextlib.suppress(InputError, LogError):
+            await hub.commit(make)
     hub.runner.restart()
 
 
