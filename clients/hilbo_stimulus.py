@@ -371,9 +371,8 @@ class Stimulus:
                 kept = _read(opened.read())
         if kept.get("token") == token and kept.get("address") == self._address:
             return kept["key"]
-        line = http.client.HTTPConnection(self._address, timeout=_JOIN)
-        status, found = _asked(line, "/api/join", {"token": token, "bearer": True}, {})
-        line.close()
+        with contextlib.closing(http.client.HTTPConnection(self._address, timeout=_JOIN)) as line:
+            status, found = _asked(line, "/api/join", {"token": token, "bearer": True}, {})
         if status != 200 or found.get("role") != "stimulus":
             raise StimulusError(found.get("error", "This link is not the one for the stimulus."))
         if file:

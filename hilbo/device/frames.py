@@ -85,8 +85,8 @@ def _unstuffed(frame: bytes) -> bytes:
     runs, position = [], 0
     while position < len(frame):
         end = position + frame[position]
-        if end > len(frame):
-            raise WireError("no COBS: a run ends beyond the frame")
+        if end == position or end > len(frame):
+            raise WireError("no COBS: a run ends beyond the frame, or has no length")
         runs.append(frame[position + 1 : end])
         position = end
     return b"\0".join(runs)

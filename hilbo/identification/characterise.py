@@ -64,8 +64,11 @@ def characterise(
     `model`: a `fitting.Model`; `seed` of the bootstrap and of quantiles. `choices`: memory lengths (None: full memory)
     to compare, in further fits; empty: no comparison. `say` receives the name of each step for progress output.
     `find_filter`: a `Sampled` with `lag="fit"` and no filter is fitted with one if the residuals indicate it
-    (`misfit`). The fit in the result is that of the model finally used. Raises `InputError` as `fitting.fit`.
+    (`misfit`). The fit in the result is that of the model finally used. Raises `InputError` as `fitting.fit`, and for
+    `choices` with a model that is not sampled, which has no memory.
     """
+    if choices and not isinstance(model, Sampled):
+        raise InputError("choices are memory lengths, which only a sampled model has; leave them out for moduli.")
     say("fitting")
     best_fit, sides = _fitted(tests, model, say, find_filter)
     sampling = intervals.spread(best_fit)

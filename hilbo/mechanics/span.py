@@ -5,6 +5,8 @@ Imports no JAX, so that study files and devices can specify a memory without it.
 
 from typing import Literal, NamedTuple
 
+from hilbo.errors import InputError
+
 __all__ = ["STATES", "Memory", "Span", "span"]
 
 Memory = Literal["short", "full"]
@@ -23,12 +25,12 @@ class Span(NamedTuple):
 def span(memory: Memory, N: int, states: int = 10) -> Span:
     """Check the memory of a model and return it, with the number that does not apply set to 0, to avoid recompilation.
 
-    Raises ValueError for an unknown memory, N below 1 (short), and a number of states not in `STATES` (full).
+    Raises InputError for an unknown memory, N below 1 (short), and a number of states not in `STATES` (full).
     """
     if memory not in ("short", "full"):
-        raise ValueError(f'memory is {memory!r}; it must be "short" (N taps) or "full" (exponentials).')
+        raise InputError(f'memory is {memory!r}; it must be "short" (N taps) or "full" (exponentials).')
     if memory == "short" and N < 1:
-        raise ValueError(f"N is {N}; it must be at least 1: the number of past samples in the sum.")
+        raise InputError(f"N is {N}; it must be at least 1: the number of past samples in the sum.")
     if memory == "full" and states not in STATES:
-        raise ValueError(f"states is {states}; it must be one of {', '.join(map(str, STATES))}.")
+        raise InputError(f"states is {states}; it must be one of {', '.join(map(str, STATES))}.")
     return Span("short", N, 0) if memory == "short" else Span("full", 0, states)

@@ -126,7 +126,8 @@ class _Straight(NamedTuple):
         )
         risen = may & (value > start_value) & (inside | (height > highest))
         end, value = jnp.where(risen, end, x), jnp.where(risen, value, start_value)
-        return (jnp.maximum(highest, value), earlier_ends.at[row].set(straight)), (end, value, start_value)
+        known = jnp.where(may, straight, jnp.nan)  # a search from an unusable start ends where no other is stopped
+        return (jnp.maximum(highest, value), earlier_ends.at[row].set(known)), (end, value, start_value)
 
     def _along_the_wall(self, x, outside):
         """Search in the optimiser's coordinates, after a search from `x` ended `outside` the feasible set.

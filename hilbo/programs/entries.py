@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import os
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,8 @@ __all__ = ["Entries", "Entry"]
 
 _SIZE = 256 * 2**20  # bytes in all; an entry has 10,000 to 3,000,000
 _SUFFIX = ".program"
+_UNFINISHED = ".part"
+_HOUR = 3600.0  # s; an entry is written in far less
 
 
 class Entry(msgspec.Struct, forbid_unknown_fields=True):
@@ -73,10 +76,14 @@ class Entries:
                 self._remark(f"{self.folder}: belongs to, or may be changed by, another user; nothing is kept there.")
                 return
             # Not by hilbo.study.disk: what a power failure loses of a cache is made again, and is known by its digest.
-            handle, name = tempfile.mkstemp(dir=self.folder)
-            with os.fdopen(handle, "wb") as file:
-                file.write(hashlib.sha256(body).digest() + body)
-            os.replace(name, self._path(entry.words))
+            handle, name = tempfile.mkstemp(suffix=_UNFINISHED, dir=self.folder)
+            try:
+                with os.fdopen(handle, "wb") as file:
+                    file.write(hashlib.sha256(body).digest() + body)
+                os.replace(name, self._path(entry.words))
+            except BaseException:
+                os.unlink(name)
+                raise
             self._drop()
         except OSError as error:
             self._remark(f"{self.folder}: programs cannot be kept there ({error.strerror}).")
@@ -90,12 +97,16 @@ class Entries:
         return {path: size for _, path, size in sorted(entries)}
 
     def clear(self) -> None:
-        """Delete all entries of the folder."""
-        for path in self.sizes():
+        """Delete all entries of the folder, unfinished ones too."""
+        for path in (*self.sizes(), *self.folder.glob(f"*{_UNFINISHED}")):
             path.unlink(missing_ok=True)
 
     def _drop(self) -> None:
-        """Delete the least recently used entries beyond the size limit."""
+        """Delete the least recently used entries beyond the size limit, and what killed processes did not finish."""
+        for path in self.folder.glob(f"*{_UNFINISHED}"):
+            with contextlib.suppress(FileNotFoundError):
+                if time.time() - path.stat().st_mtime > _HOUR:
+                    path.unlink()
         sizes = self.sizes()
         total = sum(sizes.values())
         for path, size in sizes.items():

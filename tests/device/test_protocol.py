@@ -1,5 +1,6 @@
 """The wire protocol against PROTOCOL.md, against itself, and against damage of every kind."""
 
+import contextlib
 import itertools
 import math
 import random
@@ -102,6 +103,12 @@ def test_a_message_comes_back(drawn, seq):
 def test_a_frame_of_any_bytes_comes_back(payload, kind, seq):
     frame = Frame(kind, seq, payload)
     assert decoded_frame(frames.encoded_frame(frame)[:-1]) == frame
+
+
+@given(st.binary(max_size=300))
+def test_bytes_that_are_no_frame_are_refused(content):
+    with contextlib.suppress(WireError):
+        decoded_frame(content)
 
 
 @given(messages(), messages())

@@ -112,6 +112,14 @@ def test_silence_of_the_host_is_hold(device):
     assert any("HOLD, no fresh heartbeat" in words for words in device.events())
 
 
+def test_a_simulated_device_that_has_ended_answers_nothing():
+    with pytest.raises(DeviceError, match="the line"), Renderer.open("sim", options=FAST) as device:
+        device.simulator._process.kill()
+        for _ in range(2):  # before and after the system has closed the pipe
+            with pytest.raises(DeviceError, match="has ended; open a new one"):
+                device.simulator.tell("finger hold")
+
+
 def test_self_test_of_a_good_device():
     with Renderer.open("sim", options=FAST | {"finger": "none"}) as device:
         result = device_tests.selftest(device, quiet, 100)

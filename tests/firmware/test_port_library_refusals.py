@@ -107,6 +107,12 @@ def test_k0_of_an_effective_stiffness(N, alpha):
     assert K0_of(K_eff=0.44, K1=5.0, B1=3.0, alpha=alpha, N=N) == pytest.approx(wanted, abs=1e-5)
 
 
+@pytest.mark.parametrize(("N", "words"), [(101.0, "N is 101.0; it must be"), ("101", "whole"), (-1, "at least 0")])
+def test_a_number_of_taps_that_is_none_is_refused(N, words):
+    with pytest.raises(InputError, match=words):
+        K0_of(K_eff=0.44, K1=5.0, B1=3.0, alpha=0.3, N=N)
+
+
 NORMAL = """
 #include "hilbo_renderer.h"
 #include <cmath>

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -112,6 +113,19 @@ def test_many_writers_and_readers_at_once(entries, remarks):
     with ThreadPoolExecutor(8) as pool:
         assert all(pool.map(use, range(200)))
     assert remarks == [] and len(list(entries.folder.iterdir())) == 1
+
+
+def test_what_a_killed_or_failed_write_left_goes(entries, remarks, monkeypatch):
+    for name, age in (("old.part", 7200), ("new.part", 0)):
+        (entries.folder / name).write_bytes(b"half")
+        os.utime(entries.folder / name, (time.time() - age,) * 2)
+    entries.write(ENTRY)
+    assert sorted(path.suffix for path in entries.folder.iterdir()) == [".part", ".program"]
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    entries.write(ENTRY)
+    assert len(list(entries.folder.glob("*.part"))) == 1 and "No space left" in remarks[0]
+    entries.clear()
+    assert list(entries.folder.iterdir()) == []
 
 
 def test_all_are_dropped_at_once(entries):

@@ -133,6 +133,9 @@ def test_every_point_is_feasible_and_the_session_ends(study, finished):
     assert feasible(study, session.points)
     with pytest.raises(InputError, match="all 25 trials"):
         session.ask()
+    for at in (None, asked[0]):
+        with pytest.raises(InputError, match="all 25 trials"):
+            session.tell(study.responses[0], at=at)
 
 
 def test_the_best_point_is_feasible_and_better_than_every_asked_one(study, finished):

@@ -13,10 +13,11 @@ collection or another thread may cost a tick, which is a HOLD.
 
 import ctypes
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex
 
 from hilbo.device.failures import DeviceError
 from hilbo.device.local.compiled import compiled
@@ -250,8 +251,8 @@ class HostRenderer:
 def K0_of(*, K_eff: float, K1: float, B1: float, alpha: float, N: int = 101, tick_rate_Hz: int = 1000) -> float:
     """Compute the K0 (N/mm) with which a short-memory set of N samples has the static stiffness K_eff (N/mm).
 
-    Raises `InputError` for an integer N that does not fit 32 unsigned bits, `DeviceError` if the library cannot be
-    built.
+    Raises `InputError` for an N that is no integer or does not fit 32 unsigned bits, `DeviceError` if the library
+    cannot be built.
     """
     packed = _packed(0.0, K1, B1, alpha, N, (), math.nan)
     return library().hilbo_K0_of(ctypes.byref(packed), tick_rate_Hz, K_eff)
@@ -260,14 +261,21 @@ def K0_of(*, K_eff: float, K1: float, B1: float, alpha: float, N: int = 101, tic
 def _packed(K0: float, K1: float, B1: float, alpha: float, N: int, exponentials: Any, limit: float) -> _Set:
     """Build the C struct of a parameter set; N is ignored if there are exponentials, (weight, loss) pairs.
 
-    Raises `InputError` for too many exponentials, or an N that does not fit 32 unsigned bits.
+    Raises `InputError` for too many exponentials, or an N that is no integer or does not fit 32 unsigned bits.
     """
     if len(exponentials) > _MOST_EXPONENTIALS:
         raise InputError(f"There are {len(exponentials)} exponentials; a set has at most {_MOST_EXPONENTIALS}.")
-    packed = _Set(K0, K1, B1, alpha, limit, 0 if exponentials else _fits_u32(N), len(exponentials))
+    packed = _Set(K0, K1, B1, alpha, limit, 0 if exponentials else _taps(N), len(exponentials))
     for k, (weight, loss) in enumerate(exponentials):
         packed.weight[k], packed.loss[k] = weight, loss
     return packed
+
+
+def _taps(N: int) -> int:
+    """Return N. Raises `InputError` if it is no integer, or does not fit 32 unsigned bits."""
+    if not isinstance(N, SupportsIndex):
+        raise InputError(f"N is {N!r}; it must be a whole number.")
+    return _fits_u32(operator.index(N))
 
 
 def _fits_u32(value: Any) -> Any:

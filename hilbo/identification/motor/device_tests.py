@@ -149,8 +149,8 @@ def characterise(
     complete, faults and Ctrl-C raise `CutShortError` with the data so far.
     """
     step, low = device.device.encoder_step_mm, device.device.position_low_mm
-    if not (repeats >= 1 and depth > 0 and force > 0 and hold > 0 and rest > 0):  # nor is any of them NaN
-        raise InputError("Repeats, depth, force, hold and rest must be above 0.")
+    if not (repeats >= 1 and depth > 0 and force > 0 and after >= 0 and hold > 0 and rest > 0):  # nor is any NaN
+        raise InputError("Repeats, depth, force, hold and rest must be above 0, and after 0 or above.")
     off_material = max(low / 2, -1.0)
     spread = 1 + _SPREAD * (np.random.default_rng(seed).permutation(repeats) + 0.5 - repeats / 2) / repeats
     last = {"relaxation": hold, "creep": 2 * hold}

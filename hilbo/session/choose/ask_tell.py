@@ -133,14 +133,15 @@ class Session:
 
         `at`: the rendering that was really presented, if it differs: each parameter's value by its name, as `ask` has
         one, or a row of a DataFrame. Raises `InputError` for an unknown `response`, a rendering with other parameters
-        or values out of range, and without `at` once all trials are answered.
+        or values out of range, and once all trials are answered.
         """
         step = self.step
         if response not in step.responses:
             raise InputError(
                 f'Session: "{response}" is no answer of this study; give one of {", ".join(step.responses)}.'
             )
-        shown = _asked(self) if at is None else self._point(at)
+        asked = _asked(self)
+        shown = asked if at is None else self._point(at)
         points = np.concatenate([self.points, shown[None, :]])
         points, answers = _read_only(points, np.append(self.answers, step.responses.index(response)))
         return replace(self, points=points, answers=answers, proposal=step(points, answers))
