@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hilbo import passivity
+from hilbo.errors import InputError
 from hilbo.identification import intervals
 from hilbo.identification.estimates import Estimate
 from hilbo.identification.fitting import Fit, Test, fit, nrmse, polish
