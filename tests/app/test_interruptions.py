@@ -98,12 +98,17 @@ def test_a_sleeping_laptop_begins_the_trial_again(tmp_path, monkeypatch):
         import hilbo.app.hub.interruptions as module
 
         live.begin()
-        live.until(lambda v: v["phase"] == "step")
+        name = live.until(lambda v: v["phase"] == "step")["trial"]["id"]
         real = module.time.time
         monkeypatch.setattr(module.time, "time", lambda: real() + 3600)
         live.until(lambda v: v["may"]["begin"])
         live.until(lambda _: live.events("repeat"))
         assert "slept" in live.events("note")[-1].data["text"]
+        with refused(409, "another trial"):  # a Begin that comes late
+            live.participant.post("/api/participant/begin", {"trial": name})
+        assert not live.hub.begun
+        live.begin()
+        assert live.hub.begun
 
 
 def test_a_slow_disk_is_no_laptop_that_slept(live, monkeypatch):

@@ -182,9 +182,9 @@ class Live:
         return self.experimenter.get("/api/experimenter")
 
     def begin(self) -> None:
-        """Press Begin."""
-        self.until(lambda view: view["may"]["begin"])
-        self.participant.post("/api/participant/begin", {})
+        """Press Begin, as the page does."""
+        trial = self.until(lambda view: view["may"]["begin"])["trial"]
+        self.participant.post("/api/participant/begin", {"trial": trial and trial["id"]})
 
     def question(self):
         """The view, once something is asked."""

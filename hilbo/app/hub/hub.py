@@ -264,13 +264,19 @@ class Hub:
 
     async def press(self, what: str, message: Press, page: str | None) -> None:
         """Carry out a participant's button: "break", "more" (another warm-up trial), "here" (sign of life of the page),
-        else begin: start the next block after the warm-up, or else let the runner present. `page` as in `answer`; the
-        message is not used. Raises `NotNowError`, `LogError`."""
+        else begin: start the next block after the warm-up, or else let the runner present. `page` as in `answer`.
+        Raises `NotNowError`, also for a button that was pressed during another trial or presentation than the present
+        one; `LogError`."""
         self._check_page(page)
+        if what == "here":
+            self.watchers.alive(page)
+            return
+        if message.trial not in (None, views.trial_name(self)):
+            raise NotNowError(
+                "The button was pressed during another trial, or before this one began again; look again."
+            )
         try:
-            if what == "here":
-                self.watchers.alive(page)
-            elif what == "break":
+            if what == "break":
                 await self.commit(lambda state, at: actions.pause(state, "participant", at))
             elif what == "more":
                 await self.commit(actions.more)
