@@ -45,6 +45,7 @@ from hilbo.study.estimate.optimum import predict_map
 __all__ = [
     "Plane",
     "Slice",
+    "curve",
     "draw_curve",
     "grid_slice",
     "map_handles",
@@ -273,8 +274,9 @@ def grid_slice(study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], 
     return Slice(mean, np.sqrt(variance), grid.sides)
 
 
-def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Physical values, mean and standard deviation of a map of one parameter, (m,) each."""
+def curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Physical values, mean and standard deviation of a map of one parameter, (m,) each; of a discrete one at its
+    values alone."""
     side = np.asarray(study.space.parameters[0].axis(_CELLS))
     mean, variance = surface(to_device(side[:, None]))
     return np.asarray(study.space.parameters[0].to_physical(side)), np.asarray(mean), np.sqrt(np.asarray(variance))
@@ -303,7 +305,7 @@ def draw_curve(axes, study: Study, curve: Sequence[np.ndarray], sd_label: str = 
 def _map_curve(study, surface, optimum, cohort):
     """Figure of `map_slices` for one parameter: the map's curve, the responses, and a line at the optimum."""
     figure, axes = new_figure(ONE_COLUMN, 2.5)
-    draw_curve(axes, study, _curve(study, surface), "± standard deviation", "population map")
+    draw_curve(axes, study, curve(study, surface), "± standard deviation", "population map")
     counts = mark_along(axes, study, cohort)
     best = np.asarray(study.space.to_physical(np.asarray(optimum)))[0]
     axes.axvline(float(best), color=RED, linewidth=1, label="optimum")
@@ -317,7 +319,7 @@ def _curves_beside(study, maps, optima):
     figure, axes = new_figure(ONE_COLUMN, 2.5)
     label_curve(axes, study)
     for (name, surface), x, colour in zip(maps.items(), optima, (ORANGE, GREEN, BLUE, RED), strict=False):
-        physical, mean, _ = _curve(study, surface)
+        physical, mean, _ = curve(study, surface)
         axes.plot(physical, mean, color=colour, label=name)
         best = float(np.asarray(study.space.to_physical(np.asarray(x)))[0])
         axes.plot(best, np.interp(best, physical, mean), "*", color=colour, markersize=11, markeredgecolor="white")

@@ -5,15 +5,15 @@ draw_map(study, posterior, ax=axes[0])
 draw_map(study, aggregate, ("K1", "alpha"), ax=axes[1])
 """
 
+from functools import partial
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Posterior
-from hilbo.report.figures.maps import draw_curve, plane
+from hilbo.report.figures.maps import curve, draw_curve, plane
 from hilbo.report.figures.style import label_axes, level_words, score_label, star, styled
 from hilbo.search.candidates import search_points
 from hilbo.study.config import Study
@@ -44,7 +44,7 @@ def draw_map(
     axes = _new_axes() if ax is None else ax
     best = _maximum(study, model)
     if len(names) == 1 and pair is None:
-        _curve(axes, study, model)
+        draw_curve(axes, study, curve(study, partial(_mean_and_variance, model)))
         return axes
     i, j = _places(names, names[:2] if pair is None else pair)
     grid = plane(study, best, (i, j), _CELLS)
@@ -87,11 +87,3 @@ def _mean_and_variance(model: Any, x: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Mean and variance (m,) of a posterior or an aggregate at points (m, d) of the unit cube, as NumPy arrays."""
     mean, variance = model.surface(x) if isinstance(model, Aggregate) else model.predict(x)
     return np.asarray(mean), np.asarray(variance)
-
-
-def _curve(axes: Axes, study: Study, model: Any) -> None:
-    """Draw the model of a study with one parameter on `axes`, as a curve with its standard deviation."""
-    side = np.linspace(0.0, 1.0, _CELLS)
-    mean, variance = _mean_and_variance(model, side[:, None])
-    physical = np.asarray(study.space.parameters[0].to_physical(jnp.asarray(side)))
-    draw_curve(axes, study, (physical, mean, np.sqrt(variance)))

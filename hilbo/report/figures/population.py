@@ -3,11 +3,12 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from hilbo.numerics.host import to_device
+from hilbo.report.figures.maps import curve, plane
 from hilbo.report.figures.style import (
     BLUE,
     GREY,
@@ -77,26 +78,22 @@ def coverage_figure(
 
     `predict`: points (m, d) -> mean and variance (m,); `prior`: variance of the map without responses.
     """
-    parameters = study.space.parameters
-    side = np.linspace(0.0, 1.0, _CELLS)
     figure, axes = new_figure(ONE_COLUMN, 2.9)
-    if len(parameters) == 1:
-        ratio = np.sqrt(np.asarray(predict(jnp.asarray(side[:, None]))[1]) / prior)
-        along = np.asarray(parameters[0].to_physical(jnp.asarray(side)))
+    hatch = {"hatch": "///", "facecolor": "none", "edgecolor": GREY, "linewidth": 0}
+    if study.space.dim == 1:
+        along, _, sd = curve(study, predict)
+        ratio = sd / np.sqrt(prior)
+        unknown = ratio > limit
         axes.plot(along, ratio, color=BLUE)
-        axes.fill_between(along, 0, 1, where=ratio > limit, hatch="///", facecolor="none", edgecolor=GREY)
+        axes.bar(along[unknown], 1.0, np.gradient(along)[unknown], **hatch)
         label_axes(axes, study, 0, 0)
         axes.set(ylabel="sd of the map, over that without answers", yscale="linear", ylim=(0, 1.05))
     else:
-        grid = np.tile(np.asarray(point), (_CELLS, _CELLS, 1))
-        grid[..., 0], grid[..., 1] = np.meshgrid(side, side, indexing="ij")
-        flat = grid.reshape(-1, len(parameters))
-        ratio = np.sqrt(np.asarray(predict(jnp.asarray(flat))[1]) / prior).reshape(_CELLS, _CELLS)
-        feasible = np.asarray(study.space.feasible(flat)).reshape(_CELLS, _CELLS)
-        ratio = np.where(feasible, ratio, np.nan)
-        sides = [np.asarray(p.to_physical(jnp.asarray(side))) for p in parameters[:2]]
-        shown = axes.pcolormesh(*sides, ratio.T, cmap="cividis", vmin=0, vmax=1, shading="gouraud", rasterized=True)
-        axes.contourf(*sides, ratio.T, levels=[limit, 10.0], hatches=["///"], colors="none")
+        grid = plane(study, point, cells=_CELLS)
+        ratio = grid.image(np.sqrt(np.asarray(predict(to_device(grid.points))[1]) / prior))
+        shown = axes.pcolormesh(*grid.sides, ratio, cmap="cividis", vmin=0, vmax=1, shading="nearest", rasterized=True)
+        unknown = np.ma.masked_where(~(ratio > limit), ratio)
+        axes.pcolor(*grid.sides, unknown, shading="nearest", rasterized=True, **hatch)
         figure.colorbar(shown, ax=axes, label="sd of the map, over that without answers")
         label_axes(axes, study, 0, 1)
     return figure

@@ -86,7 +86,7 @@ def _class_curves(axes, reading, shades):
     the tolerance interval if there is one.
     """
     study = reading.study
-    side = jnp.linspace(0.0, 1.0, _CELLS)
+    side = jnp.asarray(study.space.parameters[0].axis(_CELLS))
     physical_side = np.asarray(study.space.parameters[0].to_physical(side))
     chances = np.asarray(_probabilities(reading, side[:, None])).T
     label_axes(axes, study, 0, 0)

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from hilbo.report.figures.answers import answer_handles, mark_trials
-from hilbo.report.figures.maps import Slice, draw_curve, grid_slice, map_handles, map_panels, maps_beside
+from hilbo.report.figures.maps import Slice, curve, draw_curve, grid_slice, map_handles, map_panels, maps_beside
 from hilbo.report.figures.style import (
     GREEN,
     ONE_COLUMN,
@@ -41,7 +41,6 @@ __all__ = ["posterior_progress", "sets_on_map", "typical_person"]
 UNKNOWN = 0.8
 """Share of its standard deviation without answers above which a map is drawn as not sampled."""
 _MARKS = {"best": ("*", 170, GREEN), "mid": ("D", 45, ORANGE), "worst": ("X", 80, RED)}
-_CELLS = 101
 
 
 def typical_person(analysis: Analysis) -> int:
@@ -132,9 +131,7 @@ def _mark(axes, study, name, x):
 def _sets_on_curve(study, surface, points):
     """Figure of `sets_on_map` for one parameter; `points`: set name -> point (1,) of the unit cube."""
     figure, axes = new_figure(ONE_COLUMN, 2.6)
-    side = jnp.linspace(0.0, 1.0, _CELLS)
-    mean, variance = (np.asarray(moment) for moment in surface(side[:, None]))
-    draw_curve(axes, study, (np.asarray(study.space.parameters[0].to_physical(side)), mean, np.sqrt(variance)))
+    draw_curve(axes, study, curve(study, surface))
     for name, x in points.items():
         marker, size, colour = _MARKS[name]
         physical = np.asarray(study.space.to_physical(np.asarray(x)))

@@ -1,0 +1,77 @@
+"""Figures of studies with discrete parameters: nothing is evaluated between levels, where no stimulus is."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from studies import PLAIN
+from surfaces import SURFACES, TEXTURES, surfaces
+
+from hilbo.report.figures import on_axes, regions
+from hilbo.report.figures.population import coverage_figure
+from hilbo.report.figures.study import _sets_on_curve
+from hilbo.study.config import Study
+
+LEVELS = [0.0, 0.5, 1.0]
+ONE = Study.from_dict(SURFACES | {"parameters": {"texture": {"levels": list(TEXTURES)}}, "gp": PLAIN["gp"]})
+
+
+class Asked:
+    """A map with a standard deviation of 0.5, and of 1 at the second level of the last coordinate; `x`: all coordinates
+    of the points at which it was evaluated.
+    """
+
+    def __init__(self, column=-1):
+        self.x, self.column = [], column
+
+    def predict(self, points):
+        last = np.asarray(points)[:, self.column]
+        self.x += last.tolist()
+        return last, np.where(last == 0.5, 1.0, 0.25)
+
+
+def curve_of_a_map(asked, monkeypatch):
+    monkeypatch.setattr(on_axes, "_maximum", lambda study, model: np.zeros(1))
+    axes = Figure().subplots()
+    on_axes.draw_map(ONE, asked, ax=axes)
+    return axes
+
+
+def curve_of_sets(asked, monkeypatch):
+    return _sets_on_curve(ONE, asked.predict, {"best": np.array([0.5])}).axes[0]
+
+
+def curve_of_coverage(asked, monkeypatch):
+    return coverage_figure(ONE, asked.predict, np.array([0.5]), 1.0).axes[0]
+
+
+@pytest.mark.parametrize("draw", [curve_of_a_map, curve_of_sets, curve_of_coverage])
+def test_curves_are_evaluated_at_the_levels_alone(draw, monkeypatch):
+    asked = Asked()
+    np.testing.assert_array_equal(draw(asked, monkeypatch).lines[0].get_xdata(), [0, 1, 2])
+    assert set(asked.x) == set(LEVELS)
+
+
+def test_class_probabilities_are_evaluated_at_the_levels_alone(monkeypatch):
+    asked = Asked()
+    monkeypatch.setattr(regions, "_probabilities", lambda reading, x: np.tile(asked.predict(x)[1][:, None] / 3, 3))
+    regions._class_curves(Figure().subplots(), SimpleNamespace(study=ONE, tolerances={}), lambda k: "grey")
+    assert asked.x == LEVELS
+
+
+def test_an_unsampled_level_between_sampled_ones_is_hatched_and_no_more():
+    (bar,) = curve_of_coverage(Asked(), None).patches
+    assert (bar.get_x(), bar.get_width(), bar.get_hatch()) == (0.5, 1.0, "///")
+
+
+def test_the_hatched_part_of_a_coverage_map_is_that_of_whole_cells():
+    asked = Asked(1)
+    figure = coverage_figure(surfaces(), asked.predict, np.full(3, 0.5), 1.0)
+    FigureCanvasAgg(figure).draw()
+    assert set(asked.x) == set(LEVELS)
+    shades, hatched = figure.axes[0].collections
+    np.testing.assert_array_equal(shades.get_array()[:, 0], [0.5, 1.0, 0.5])
+    sides = [path.vertices[:, 1] for path in hatched.get_paths()]
+    assert hatched.get_hatch() == "///" and {*np.concatenate(sides)} == {0.5, 1.5}
