@@ -249,7 +249,8 @@ class Renderer:
         return self._link.request(GetStatus())
 
     def state(self) -> State:
-        """Ask the device for its state."""
+        """Ask the device for its `State`: STOPPED, RUNNING, STOPPING, DRIVING, HOLD or ESTOP. `status` has counters
+        too."""
         return State(self.status().state)
 
     def condition(self) -> Condition:

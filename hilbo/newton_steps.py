@@ -105,7 +105,8 @@ class Ascent(Protocol):
     """Interface of a concave log posterior in coordinates of any shape, which `DampedNewton` maximises."""
 
     def at(self, point: Array, /) -> tuple[Height, PyTree]:
-        """Height at a point, and intermediate results at that point, which are passed to `towards`."""
+        """The `Height` at a point (log posterior, its rounding error, a bound on the distance to the mode and the
+        tolerance of that), and intermediate results there, which are passed to `towards`."""
         ...
 
     def towards(self, point: Array, known: PyTree, /) -> tuple[Array, Scalar]:

@@ -99,8 +99,9 @@ def dc_gain(
 ) -> Float[Array, "..."]:
     """Static stiffness H(1) (N/mm) of the sampled model; elementwise.
 
-    K0 and K1 in N/mm, B1 in N·s^α/mm, T in s. Raises `InputError` for values out of range; where these are traced the
-    result is NaN.
+    K0 (any number) and K1 in N/mm, B1 in N·s^α/mm, T in s; arrays that broadcast. Raises `InputError` for K1 < 0, B1 <
+    0 or infinite, alpha outside (0, 1], T not above 0 or infinite, N < 1 and an unknown memory; where the numbers are
+    traced the result is NaN.
     """
     return elementwise(_dc_gain, span(memory, N), K0, K1, B1, alpha, T)
 

@@ -155,8 +155,8 @@ def passivity(
 
 
 def _rendered(K0: float | None, K1: float, B1: float, alpha: float, renderer: dict[str, Any]) -> Any:
-    """The FO-SLS as a renderer samples it; K0 (N/mm) from the effective stiffness where it is None. Raises `InputError`
-    for an order outside (0, 1] then."""
+    """The FO-SLS as a renderer samples it; where K0 (N/mm) is None, with the K0 that gives the renderer's effective
+    stiffness. Raises `InputError` for K1, B1 or alpha that `FOSLS` refuses, with or without K0."""
     import numpy as np
 
     from hilbo.viscoelastic import FOSLS

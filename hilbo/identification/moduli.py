@@ -67,7 +67,8 @@ class Continuous(eqx.Module):
         return np.array([[1.2 * top, 0.5 * last, np.log(kappa), np.log(a / (1 - a))] for kappa, a in pairs])
 
     def prepare(self, test: Test) -> Curve:
-        """Convert a test of moduli to a `Curve`, with the scale of its residuals by `weights`."""
+        """Convert a test of moduli to a `Curve` with the outputs of all repeats. `scale` is the range of their mean, at
+        every time; for weights "relative" it is that mean itself. Nothing is checked."""
         return _prepare(test, self.weights)
 
     def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:

@@ -78,10 +78,9 @@ def _taps(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
 
 
 def _means(alpha: Scalar, before: Scalar, span: Span, block: int) -> _History:
-    """Block form of full memory: the state is one mean for each exponential, |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1}.
-
-    All means are `before` at the start.
-    """
+    """History of full memory in blocks, with `span.states` exponentials: |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1} (`taps`),
+    and the `carry` p_k λ_k^j of a block's samples. The state is one fading mean for each exponential, all `before` at
+    the start; `write` advances them by a block."""
     weight, loss = exponentials(alpha, span.states)
     # As products, which have derivatives at λ = 0.
     powers = jnp.cumprod(jnp.concatenate([jnp.ones_like(loss)[None], jnp.tile(1 - loss, (block - 1, 1))]), axis=0)

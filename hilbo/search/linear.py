@@ -149,10 +149,11 @@ def _distance_to_wall(normals, offsets, w, direction) -> tuple[Float[np.ndarray,
 def ends_of_rays(
     walls: Walls, w: Float[np.ndarray, "n d"], free: Bool[np.ndarray, " d"], seed: int, shares: Sequence[float]
 ) -> Float[np.ndarray, "n d"]:
-    """Points on the walls: from each point along a random ray to a wall, then along that wall to the next, and so on.
+    """Points on the walls, the cube's faces among them: from each point along a random ray to a wall, then along that
+    wall to the next, and so on.
 
-    `shares`: fraction of the points that stop after one wall, after two, and so on; the rest end at corners.
-    Coordinates that are not `free` stay fixed.
+    `shares`, which sum to 1: fractions of the points that stop after one wall, after two, and so on, at most at a
+    corner. Coordinates that are not `free` stay fixed.
     """
     rng, (normals, offsets) = np.random.default_rng(seed), _with_cube(walls)
     d = int(free.sum())

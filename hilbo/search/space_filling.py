@@ -36,7 +36,11 @@ def take(
 
 
 def sobol_chunks(dim: int, count: int, seed: int) -> Chunks:
-    """Yield without end scrambled Sobol' points in chunks; the first has `count`, rounded up to a power of 2."""
+    """Yield without end the points of one scrambled Sobol' sequence in chunks (n, dim).
+
+    The first chunk has `count` points, rounded up to a power of 2 (1 for 0); each later one 16 times as many, up to
+    2^18 or the size of the first, whichever is larger.
+    """
     from scipy.stats import qmc  # slow to import, and only this module needs it
 
     engine = qmc.Sobol(dim, rng=np.random.default_rng(seed))

@@ -10,8 +10,9 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from bare_server import Bare, connected, request, status, until_closed, until_words
+from bare_server import Bare, Nothing, connected, request, status, until_closed, until_words
 
+from hilbo.app.server import serve
 from hilbo.app.server.round_robin import RoundRobin
 from hilbo.app.server.serve import _Admission
 
@@ -311,3 +312,19 @@ def test_one_of_each_goes_on_at_every_turn():
     assert gone[:4] == [(0, "participant"), (0, None), (1, "participant"), (1, None)]
     assert [who for who, role in gone if role is None] == [*range(7), *range(8, 30)]
     assert [who for who, role in gone if role] == [0, 1, 2, 3, 4]
+
+
+def test_what_is_told_of_the_start_may_fail_and_the_session_is_closed(tmp_path):
+    """A terminal that is gone, say: the device's watchdog is not the only one to notice."""
+    hub, closed = Nothing(), []
+
+    async def close():
+        closed.append(True)
+
+    def started(stop):
+        raise OSError("the terminal is gone")
+
+    hub.close = close
+    with pytest.raises(OSError, match="the terminal is gone"):
+        serve.serve(serve.bound(0, keys=tmp_path / "keys"), hub, started)
+    assert closed == [True]

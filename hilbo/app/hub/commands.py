@@ -73,9 +73,9 @@ def _event_of(what: str, message: Command) -> Callable[[LiveSession, float], Eve
 
 
 def _resume_event(hub: HubInterface) -> Callable[[LiveSession, float], Event]:
-    """A function of (state, time) that makes the event of the command resume: the end of the break or, without a break,
-    the start of the next block. It also sets `hub.begun` to whether the participant's page is open; if not, they must
-    press Begin."""
+    """Function of (state, time) that makes the event of the command resume: the end of the break or, without a break,
+    the start of the next block. It raises `RefusedError` if there is neither. When called, it then also sets
+    `hub.begun` to whether the participant's page is open; if it is not, they must press Begin."""
 
     def make(state, at):
         event = (actions.resume if state.paused is not None else actions.go_on)(state, at)

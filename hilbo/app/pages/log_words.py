@@ -180,8 +180,9 @@ def _values(state: LiveSession, trial: Trial) -> list[Any]:
 
 
 def _remark(state: LiveSession, trial: Trial) -> str:
-    """Why a trial does not count, which trial it repeats, how often it was presented, whether it will be repeated;
-    parts are separated by semicolons, and empty if none applies."""
+    """What there is to say about a trial, separated by "; ", empty for an answered trial to which nothing applies:
+    "now" for the pending trial, or why a trial does not count; which trial it repeats; how often it was presented, if
+    more than once; whether it will be repeated."""
     reason = str((trial.voided or {}).get("reason", ""))
     status = {
         "void": "void",

@@ -76,7 +76,9 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any], 
     """Open the hub, call `started(stop)`, answer requests until Ctrl-C, SIGTERM or a call of `stop`, then close the hub
     and the socket. `tried`: makes the data of the page of `hilbo try` (`Tried`), for that command.
 
-    Raises what keeps the hub from opening, `InputError` or `DeviceError`; no request has been answered then.
+    Returns after `stop`; a signal is raised again once the hub is closed: KeyboardInterrupt, or the process ends.
+    Raises what keeps the hub from opening, `InputError` or `DeviceError`, and what `started` raises, with the hub
+    closed; no request has been answered then. The interval of thread switches and the limit of open files stay changed.
     """
     from hilbo.app.server.admission import Listener
 
@@ -120,11 +122,11 @@ def _open_and_close(
             await hub.open()
             await listen(sockets=sockets)
             listener.open()
+            if not server.should_exit:
+                started(stop)
         except BaseException:
             await hub.close()
             raise
-        if not server.should_exit:
-            started(stop)
 
     async def shutdown(sockets=None):
         listener.close()

@@ -71,7 +71,8 @@ class LeftOut:
 
     @property
     def cost(self) -> Float[np.ndarray, " n"]:
-        """Negative log predictive density of each response, (n,), in nats."""
+        """Negative log predictive density of each response, (n,), in nats: -`log_given`, which is finite also where the
+        probability is 0 in this precision; without `log_given` -log of the probability, inf at 0."""
         if self.log_given is None:
             return -np.log(self.probabilities[np.arange(len(self.q)), self.q])
         return -self.log_given

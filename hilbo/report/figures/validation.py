@@ -27,9 +27,11 @@ def validation_figure(confusion: pd.DataFrame, preferences: pd.DataFrame) -> Fig
 
 @styled
 def aggregate_best_figure(people: pd.DataFrame, overall: pd.DataFrame) -> Figure:
-    """Share of comparisons in which the aggregate's set was preferred to an individual's, person by person and overall.
+    """Figure of the share of comparisons in which the aggregate's set was preferred to an individual's, by person and
+    overall.
 
-    `people`: columns `name`, `rate`, `low`, `high`; `overall`: of `preferences.rate`, all kinds of interval.
+    `people`: columns `name`, `rate`, `low`, `high`, a row for each person. `overall`: the rows of `preferences.rate`,
+    of which the one with the widest interval is drawn.
     """
     best = _widest(overall)
     rows = np.arange(len(people))[::-1] + 1

@@ -170,8 +170,9 @@ def _to_unit(study: Study, physical: Float[np.ndarray, "k d"]) -> Float[np.ndarr
 
 
 def _padded(study: Study, excluded: Float[np.ndarray, "k d"]) -> Float[Array, "r d"]:
-    """Excluded points in the unit cube, padded with rows far away to a fixed number, so that another one needs no
-    compilation."""
+    """The points `excluded` (k, d), in physical units, as the last rows of an array (r, d) in the unit cube. Rows far
+    outside the cube fill it up to `_ROOM` rows, so that one more point needs no compilation; more points are not filled
+    up."""
     rows = np.full((max(_ROOM, len(excluded)), study.space.dim), _FAR)
     if len(excluded):
         rows[-len(excluded) :] = _to_unit(study, excluded)

@@ -62,11 +62,11 @@ def _names_participant(path: Path, participant: str) -> bool:
 
 
 def commands_of(folder: Path, participant: str, go: set[Path], files: Iterable[Path]) -> list[str]:
-    """Commands that compute results again: `hilbo report` for each folder in them that has its own tables, else the
-    recorded command without the participant; empty if it concerned nobody else.
+    """Shell commands that compute the results in `folder` again: `hilbo report` for each folder in them that keeps
+    tables of its own, else the recorded command without the participant in --names and --participants; empty if those
+    name nobody else. A sentence in their place if no command is recorded.
 
-    `go`: files that are deleted; `files`: all files. For results without a record it is a sentence in place of a
-    command.
+    `go`: files that will be deleted, and so count as no tables; `files`: all files.
     """
     results, stay = listed(folder), [path for path in files if folder in path.parents and path not in go]
     own = [path.parent for path in stay if path.name == "trials.csv" and path.with_name("study.toml") in stay]

@@ -118,8 +118,12 @@ def delete_participant(folder: str | os.PathLike, participant: str, done: Withdr
 
 
 def _journal(root: Path, participant: str) -> Withdrawal:
-    """Read the journal of an interrupted withdrawal, or write and return a new one. Raises InputError if it cannot be
-    read or is another participant's, or a withdrawal was interrupted in a folder above."""
+    """Read the journal of an interrupted withdrawal; if there is none, write and return a new one, with the participant
+    (not checked) and a new pseudonym, and nothing planned yet.
+
+    Raises `InputError` if it cannot be read or written or is another participant's, or if a withdrawal was interrupted
+    in a folder above.
+    """
     path = root / JOURNAL
     if above := withdrawal_above(Path(os.path.realpath(root)).parent):
         raise InputError(f"{above}: a withdrawal was interrupted there; give its command again first.")

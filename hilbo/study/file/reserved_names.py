@@ -35,7 +35,8 @@ _EVERYWHERE = frozenset((*TRIAL_COLUMNS, *_OF_CSV, *(name for names in _OF_FILES
 
 
 def is_reserved(name: str, responses: Collection[str], rendered: bool) -> bool:
-    """Whether a parameter may not have this name in a study with these response labels. `rendered`: the study has a
-    [renderer], which reserves more names."""
+    """Whether a parameter may not have exactly this name: that of a column of hilbo's tables or results, "P(LABEL)" of
+    one of these response labels, or, if the study has a [renderer] (`rendered`), K0, N, T, memory, states or
+    force_limit."""
     predicted = {f"P({label})" for label in responses}
     return name in _EVERYWHERE or name in predicted or (rendered and name in _RENDERED)
