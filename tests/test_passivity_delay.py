@@ -257,7 +257,7 @@ def test_a_traced_delay_beyond_t_is_not_a_number():
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize("N", [101, 25, 1, 401])
+@pytest.mark.parametrize("N", [101, 25, 1, pytest.param(401, marks=pytest.mark.release)])
 def test_bounds_of_many_sets_are_what_is_proved(N):
     K1, B1, alpha, delay = random_sets(256, N)
     needed = np.asarray(passivity.minimum_damping(K1, B1, alpha, 0.44, N, delay=delay))
