@@ -1,5 +1,8 @@
-"""Figures of studies with discrete parameters: nothing is evaluated between levels, where no stimulus is."""
+"""Figures of studies with discrete parameters: nothing is evaluated between levels, where no stimulus is, and levels
+have no order.
+"""
 
+from concurrent.futures import Future
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +14,11 @@ from surfaces import SURFACES, TEXTURES, surfaces
 
 from hilbo.report.figures import on_axes, regions
 from hilbo.report.figures.population import coverage_figure
+from hilbo.report.figures.progress import progress_figure
 from hilbo.report.figures.study import _sets_on_curve
+from hilbo.report.results import misses
+from hilbo.study.analysis.cohort_results import CohortResults
+from hilbo.study.analysis.progress import Progress
 from hilbo.study.config import Study
 
 LEVELS = [0.0, 0.5, 1.0]
@@ -75,3 +82,19 @@ def test_the_hatched_part_of_a_coverage_map_is_that_of_whole_cells():
     np.testing.assert_array_equal(shades.get_array()[:, 0], [0.5, 1.0, 0.5])
     sides = [path.vertices[:, 1] for path in hatched.get_paths()]
     assert hatched.get_hatch() == "///" and {*np.concatenate(sides)} == {0.5, 1.5}
+
+
+def test_distances_to_the_truth_are_those_of_the_tables(monkeypatch):
+    """Another level is away by the whole range, whichever it is."""
+    study, truth = surfaces(), np.array([0.5, 0.0, 0.5])
+    optima = np.array([[0.5, 1.0, 0.5], [0.3, 0.5, 0.5], [0.4, 0.0, 0.5]])
+    counts, none = np.arange(1, 4), np.zeros((3, 0))
+    progress = Progress(counts, optima, optima[:, None], np.array([3]), none, np.ones((3, 1)), {}, (0, 3, 0))
+    monkeypatch.setattr("hilbo.report.figures.progress._top_answers", lambda *_: None)
+    following = Future()
+    following.set_result(progress)
+    done = CohortResults(study, SimpleNamespace(cohort=None), following, 0, None, None)
+    left = progress_figure(study, done, truth).axes[0]
+    expected = 100 * misses(study, optima, truth)[0]
+    for line in left.lines[:2]:  # of individuals, of which there is one, and of the population
+        np.testing.assert_allclose(line.get_ydata(), expected)

@@ -95,8 +95,8 @@ def progress_figure(study: Study, population: CohortResults, truth: Float[np.nda
     to_end, individual_errors = progress.to_end()
     from_goal = to_end
     if truth is not None:
-        from_goal = np.sqrt(np.mean((progress.population - truth) ** 2, axis=1))
-        individual_errors = np.sqrt(np.mean((progress.individual - truth) ** 2, axis=2))
+        from_goal = np.asarray(nrmse(progress.population, truth, progress.levels))
+        individual_errors = np.asarray(nrmse(progress.individual, truth, progress.levels))
     figure, (left, right) = new_figure(TWO_COLUMNS, 2.7, 1, 2)
     goal = "the final optimum" if truth is None else "the truth"
     band(left, trials, 100 * individual_errors.T, BLUE, "individuals: median, quartiles")
