@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol, runtime_checkable
 
-from hilbo.app.rigs.rig import Rig
+from hilbo.app.rigs.rig import Notice, Rig
 from hilbo.app.wire.security import Role
 from hilbo.session.log.records import Event
 from hilbo.session.log.state import LiveSession
@@ -99,8 +99,8 @@ class HubInterface(Protocol):
         ...
 
     @property
-    def recent(self) -> Sequence[Event]:
-        """The latest events, newest first."""
+    def recent(self) -> Sequence[Event | Notice]:
+        """The latest events, and what the device sent unasked, which the log does not hold; newest first."""
         ...
 
     @property

@@ -6,6 +6,7 @@ from fake_device import FakeDevice
 from live_server import Live
 
 from hilbo.app.hub import runner
+from hilbo.app.pages import blind
 from hilbo.device.reasons import HoldReason, SampleFlag, State
 from hilbo.session.export.tables import trials_table
 from hilbo.study.file.plan_file import Block, Planned
@@ -128,6 +129,11 @@ def test_the_reason_of_a_hold_is_on_the_experimenter_s_page(tmp_path):
         assert ["Reason", words] in view["device"]["rows"]
         assert view["phase_words"] == f"Stopped: The device is in HOLD: {words}."
         live.until(lambda v: f"The device holds: {words}. W1 is void." in str(v["log"]), live.whole)
+        live.fake.notices.append("tick 7: STOPPED, it was asked to")
+        view = live.until(lambda v: v["log"][0][0] == "", live.whole)
+        assert view["log"][0][2] == "The device, tick 7: STOPPED, it was asked to."
+        seqs = [seq for seq, _, _ in blind.experimenter(live.hub, view)["log"]]
+        assert seqs and all(seqs)
 
 
 def test_a_start_that_a_stop_has_overtaken_is_said_and_tried_again_from_the_first_step(tmp_path, monkeypatch):

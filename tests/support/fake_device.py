@@ -17,7 +17,7 @@ __all__ = ["FakeDevice"]
 
 class FakeDevice(Renderer):
     """`pressed`: a hand presses the handle. `told`: what was carried out, in its order; `starts`: how often START was
-    sent. `arrives(flags)`: samples of the telemetry."""
+    sent. `arrives(flags)`: samples of the telemetry; `notices`: sentences that it sends unasked."""
 
     notes = ()
     simulator = None
@@ -29,7 +29,7 @@ class FakeDevice(Renderer):
         self.pressed, self.told, self.starts = pressed, [], 0
         self.now, self.why, self.flags = State.STOPPED, HoldReason.BOOT, DeviceFlag.HOMED
         self.link = SimpleNamespace(name="fake", stops=0, restarted=False, faint=False)
-        self._samples = []
+        self._samples, self.notices = [], []
 
     def arrives(self, *flags):
         self._samples += flags
@@ -85,7 +85,8 @@ class FakeDevice(Renderer):
             self.told.append("clear")
 
     def events(self):
-        return []
+        sent, self.notices = self.notices, []
+        return sent
 
     def close(self):
         self.told.append("close")

@@ -21,7 +21,7 @@ from hilbo.app.hub.commands import NotNowError
 from hilbo.app.hub.interruptions import Interruptions
 from hilbo.app.hub.runner import Runner
 from hilbo.app.pages import blind, views
-from hilbo.app.rigs.rig import Rig, Snapshot
+from hilbo.app.rigs.rig import Notice, Rig, Snapshot
 from hilbo.app.wire.messages import Answer, Command, Press
 from hilbo.app.wire.security import Role
 from hilbo.app.wire.watchers import Watchers
@@ -33,7 +33,7 @@ from hilbo.session.log.state import LiveSession
 __all__ = ["PRESSES", "Hub"]
 
 _WHY = 200  # characters of an error
-_RECENT = 200  # events that the experimenter's page may show
+_RECENT = 200  # events and notices that the experimenter's page may show
 PRESSES = ("begin", "break", "more", "here")
 Result = TypeVar("Result")
 
@@ -341,5 +341,6 @@ class Hub:
         self._loop.call_soon_threadsafe(self._interruptions.device_changed, seen)
 
     def _noticed(self, sentence: str) -> None:
-        """Notify the pages, from the rig's thread, after a sentence of the device; the sentence itself is not kept."""
+        """Show a sentence of the device, from the rig's thread, among the events of the experimenter's page."""
+        self._loop.call_soon_threadsafe(self.recent.appendleft, Notice(time.time(), sentence))
         self._loop.call_soon_threadsafe(self.publish)

@@ -1,8 +1,8 @@
 """The view of an experimenter who must not know the parameters: progress, answers, and labels of renderings.
 
-Only what can hold no parameter is copied from the full view: names of sets, choices, predictions, confirmed values and
-reasons that state values are left out. Each rendering has a label (`set_codes.label_of`), the same that the preparer
-sees.
+Only what can hold no parameter is copied from the full view: names of sets, choices, predictions, confirmed values,
+reasons that state values and what a device sends unasked are left out. Each rendering has a label
+(`set_codes.label_of`), the same that the preparer sees.
 """
 
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ def experimenter(hub: HubInterface, seen: Mapping[str, Any]) -> View:
         "device": seen["device"] | {"rows": [row for row in seen["device"]["rows"] if row[0] != "Refused"]},
         "trust": [],
         "table": _table(hub, seen["table"]["rows"]),
-        "log": [log_words.line(state, _unvalued(event)) for event in list(hub.recent)[:60]],
+        "log": [log_words.line(state, _unvalued(event)) for event in hub.recent if isinstance(event, Event)][:60],
         "map_version": "",
         "whole": whole,
     }

@@ -6,6 +6,7 @@ from datetime import datetime
 from typing import Any
 
 from hilbo.app.pages.pace import duration
+from hilbo.app.rigs.rig import Notice
 from hilbo.session.log.actions import restorable
 from hilbo.session.log.records import Event, Trial
 from hilbo.session.log.state import LiveSession
@@ -31,9 +32,11 @@ def meant(trial: Trial | None) -> dict[str, Any] | None:
     return None if trial is None else {"trial": trial.id, "name": place_of(trial)}
 
 
-def line(state: LiveSession, event: Event) -> list[str]:
-    """An event's sequence number, local time of day, and sentence, as three texts."""
+def line(state: LiveSession, event: Event | Notice) -> list[str]:
+    """An event's sequence number ("" for a device's notice), local time of day, and sentence, as three texts."""
     at = datetime.fromtimestamp(event.time).strftime("%H:%M:%S")
+    if isinstance(event, Notice):
+        return ["", at, f"The device, {event.text}."]
     return [str(event.seq), at, sentence(state, event)]
 
 

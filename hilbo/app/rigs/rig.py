@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from hilbo.study.file.protocols import Show
 
-__all__ = ["Loaded", "MissedError", "Rig", "Showing", "Snapshot"]
+__all__ = ["Loaded", "MissedError", "Notice", "Rig", "Showing", "Snapshot"]
 
 
 class Snapshot(NamedTuple):
@@ -29,6 +29,13 @@ class Snapshot(NamedTuple):
     facts: Mapping[str, Any] = {}
     rows: tuple[tuple[str, str], ...] = ()
     excused: bool = False
+
+
+class Notice(NamedTuple):
+    """A sentence that a device sent unasked, without a full stop, and when it arrived, s since the epoch."""
+
+    time: float
+    text: str
 
 
 class Showing(NamedTuple):

@@ -104,7 +104,7 @@ function restoring(meant) {
 }
 
 function drawLog() {
-  const mark = String(view.log.length ? view.log[0][0] : "");
+  const mark = String(view.log.length ? view.log[0] : "");
   if (at("log").dataset.shown === mark) return;
   at("log").dataset.shown = mark;
   at("log").replaceChildren(...view.log.map((cells) => {
