@@ -294,6 +294,19 @@ def test_flags_are_counted_from_the_first_step_of_the_presentation_to_the_answer
     assert {name.upper() for name in FLAGS} <= set(SampleFlag.__members__)
 
 
+def test_nobody_waits_for_a_job_that_comes_too_late_for_the_closed_rig():
+    rig = DeviceRig(STUDY, FakeDevice)
+    under_way, queued = rig.do(lambda _: rig._ending.wait(10)), rig.do(lambda device: device.told.append("late"))
+    given_up = rig.do(lambda _: None)
+    given_up.cancel()
+    rig.close()
+    late = rig.do(lambda device: device.told.append("later"))
+    assert under_way.result(1)
+    for job in (queued, late):
+        assert isinstance(job.exception(1), DeviceError)
+    assert rig.device.told == ["close"]
+
+
 def test_the_hardware_stop_and_a_hot_motor_are_words():
     device = FakeDevice()
     with rig_of(device) as rig:

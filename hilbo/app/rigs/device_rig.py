@@ -61,9 +61,11 @@ class DeviceRig:
 
     def do(self, job: Callable[[Renderer], Any]) -> Future:
         """Queue `job(device)` for the rig's thread; its future has the result, or the exception: `DeviceError` while
-        the device is lost."""
+        the device is lost, and once `close` was called."""
         result: Future = Future()
         self._jobs.put((lambda: job(self._ready()), result))
+        if self._ending.is_set():
+            self._refuse_jobs()
         return result
 
     @property
@@ -136,12 +138,22 @@ class DeviceRig:
         """Do nothing: no client waits for a device."""
 
     def close(self) -> None:
-        """End the thread, in at most 10 s, then stop the device and disconnect; errors of the device are ignored."""
+        """End the thread, in at most 10 s, refuse all jobs that it has not begun, then stop the device and disconnect;
+        errors of the device are ignored."""
         self._ending.set()
         self._jobs.put(None)
         self._thread.join(10)
+        self._refuse_jobs()
         with contextlib.suppress(DeviceError):
             self.device.close()
+
+    def _refuse_jobs(self) -> None:
+        """Take all jobs out of the queue; each one's exception is a `DeviceError`."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                _, result = self._jobs.get_nowait() or (None, None)
+                if result is not None and result.set_running_or_notify_cancel():
+                    result.set_exception(DeviceError("The session has ended, and the device is disconnected."))
 
     def _wanted(self, showing: Showing) -> ParameterSet:
         """The set of a rendering, with memory and sampling period of its material's renderer."""
