@@ -103,15 +103,15 @@ def _learnt(
 def _error(maximum: MaximumEvidence, trials: Trials, shared: bool) -> Float[Array, "*M"]:
     """Laplace's minus EP's log evidence, nats per response, at the learnt hyperparameters.
 
-    A scalar over all participants if `shared`, else (M,), 0 for a participant without responses.
+    A scalar over all participants if `shared`, else (M,); 0 without responses.
     """
 
     def by_ep(gp, trials):
         return fit(gp, trials, inference="ep", throw=False).log_evidence
 
-    counts = jnp.sum(trials.mask, axis=1, dtype=trials.x.dtype)
+    counts = jnp.sum(trials.mask, axis=None if shared else 1, dtype=trials.x.dtype)
     if shared:
-        together = jnp.sum(jax.lax.map(lambda t: by_ep(maximum.gp, t), trials))
-        return (maximum.log_evidence - together) / jnp.sum(counts)
-    errors = maximum.log_evidence - jax.lax.map(lambda pair: by_ep(*pair), (maximum.gp, trials))
-    return jnp.where(counts > 0, errors / jnp.where(counts > 0, counts, 1.0), 0.0)  # no responses, no error
+        evidence = jnp.sum(jax.lax.map(lambda t: by_ep(maximum.gp, t), trials))
+    else:
+        evidence = jax.lax.map(lambda pair: by_ep(*pair), (maximum.gp, trials))
+    return jnp.where(counts > 0, (maximum.log_evidence - evidence) / jnp.maximum(counts, 1.0), 0.0)

@@ -1,5 +1,7 @@
 """Laplace's evidence is judged where its search ended: against the exact evidence, and what follows from it."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,3 +69,14 @@ def test_only_those_who_were_misjudged_are_named():
     everybody = MaximumEvidence(model(0.7), error, error.astype(int), again, again, ("noise",))
     (sentence,) = judged_sentences(Judged(everybody, error, again))
     assert sentence.startswith("Laplace's evidence of 2 people was off by 0.2 nats an answer")
+
+
+def test_without_any_response_nothing_is_misjudged(monkeypatch):
+    none = jax.tree.map(lambda leaf: leaf[None], Trials.from_arrays(np.zeros((0, 1)), np.zeros(0, int), 3))
+    at, yes = jnp.zeros(()), jnp.asarray(True)
+    start = MaximumEvidence(model(0.7), at, jnp.asarray(1), yes, yes, ("noise",))
+    monkeypatch.setattr(judged_evidence, "_learnt", lambda *_: start)  # no search, and nothing to compile
+    monkeypatch.setattr(judged_evidence, "_error", judged_evidence._error.__wrapped__)
+    monkeypatch.setattr(judged_evidence, "fit", lambda *_, **__: SimpleNamespace(log_evidence=at))
+    judged = maximise_judged(model(0.7), none, ("noise",))
+    assert float(judged.error) == 0.0 and not bool(judged.again) and judged_sentences(judged) == []
