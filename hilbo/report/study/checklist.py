@@ -46,7 +46,7 @@ def checklist(analysis: Analysis, content: dict[str, Any], validated: bool) -> l
         Item("Computation", _computation(analysis, content), ""),
         Item("Posterior", _posterior(analysis, content), ""),
         Item("Posterior prediction", _prediction(content, validated), ""),
-        Item("Decisions", "No hypothesis is accepted or rejected by a bound on this page.", _decisions(analysis)),
+        Item("Decisions", "No hypothesis is accepted or rejected by a bound on this page.", _decisions()),
         Item("Sensitivity", _sensitivity(content), ""),
         Item(
             "Reproducibility",
@@ -125,7 +125,7 @@ def _prediction(content, validated):
     )
 
 
-def _decisions(analysis):
+def _decisions():
     """The line on decisions, which is left to the authors."""
     return f"{_OPEN}what is decided by these results, by which bound, and whether it was set before."
 
