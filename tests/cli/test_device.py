@@ -88,6 +88,8 @@ def test_set(device, sets):
         (["set", "--sets", "sets.csv", "--name", "X"], 2, 'holds no set "X"'),
         (["set", "--sets", "none.csv"], 2, "none.csv: cannot be read"),
         (["start"], 1, "The device has no set in force; send one first."),
+        (["stop"], 2, "--device is missing"),
+        (["estop", "--device", "sim"], 2, "would stop a new simulated device, and nothing that moves"),
         (["hello", "--sim", "finger"], 2, "write KEY=VALUE"),
         (["hello", "--sim", "finger=thumb"], 2, "--finger thumb makes no sense"),
         (["hello", "--baud", "0"], 2, "--baud"),
@@ -155,15 +157,12 @@ def test_a_device_that_goes_to_hold_is_a_failure(device, monkeypatch):
         self.simulator.tell("bad 5")
 
     monkeypatch.setattr(Renderer, "start", start)
-    code, _, stderr = device("start", *A, "--seconds", 0.5, *FAST)
-    assert code == 1
-    assert "too many positions were bad" in " ".join(stderr.split())
-    assert "The device has gone to HOLD by itself" in stderr
+    code, stdout, stderr = device("start", *A, "--json", *FAST)  # ends without --seconds
+    assert (code, json.loads(stdout)["state"]) == (1, "HOLD")
+    assert "The device has gone to HOLD by itself: too many positions were bad" in " ".join(stderr.split())
 
 
-def test_stop_estop_and_monitor(device):
-    for command in ("stop", "estop"):
-        assert device(command, "--json", *FAST)[0] == 0
+def test_monitor(device):
     code, stdout, _ = device("monitor", "--seconds", 0.2, "--json", *FAST)
     assert (code, json.loads(stdout)["state"]) == (0, "STOPPED")
 
@@ -289,6 +288,7 @@ def test_a_device_that_stays_serves_one_command_after_another(device, staying):
     _, stdout, stderr = device("monitor", *staying, "--seconds", 0.1, "--json")
     assert "The device is in ESTOP" in stderr and json.loads(stdout)["estops"] == 1
     assert device("clear", *staying)[:2] == (0, "the device is STOPPED\n")
+    assert device("stop", *staying)[:2] == (0, "done\n")
     command = [*HILBO, "start", *map(str, staying)]
     running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
     while "tick" not in running.stderr.readline():

@@ -91,30 +91,31 @@ def set_(chosen: Chosen, line: Line, as_json: JsonToo = False) -> None:
 def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: JsonToo = False) -> None:
     """Render the set that is in force, or the one that is given, until Ctrl-C; then stop.
 
-    Exit code 1 if the device is then in HOLD or ESTOP.
+    Ends at once, with the reason and exit code 1, if the device goes to HOLD or ESTOP.
     """
     from hilbo.cli.device.screen import watch
 
     wanted = chosen_set(chosen, line)
     with opened(line) as device:
         _begin(device, wanted)
-        content = watch(device, seconds, "rendering; Ctrl-C stops")
+        content = watch(device, seconds, "rendering; Ctrl-C stops", while_free=True)
     print_result(content, "", as_json)
     if content["state"] in ("HOLD", "ESTOP"):
-        fail(f"The device has gone to {content['state']} by itself; find out why, then clear it.", 1)
+        words = f"The device has gone to {content['state']} by itself: {content['reason']}"
+        fail(f"{words}; find out why, then clear it.", 1)
 
 
 @app.command()
 @takes(line=Line)
 def stop(line: Line, as_json: JsonToo = False) -> None:
-    """Force to zero, smoothly, even if another program started it; prints that it is done."""
+    """Force to zero, smoothly, even if another program started it; prints that it is done. Needs --device."""
     _at_once(line, "Stop", as_json)
 
 
 @app.command()
 @takes(line=Line)
 def estop(line: Line, as_json: JsonToo = False) -> None:
-    """Force to zero at once, latched until `clear`."""
+    """Force to zero at once, latched until `clear`. Needs --device."""
     _at_once(line, "Estop", as_json)
 
 
@@ -266,18 +267,19 @@ def _begin(device: Any, wanted: dict[str, Any] | None) -> None:
 
 def _at_once(line: Line, name: str, as_json: bool) -> None:
     """Send "Stop" or "Estop" as the first message of a connection, which a device obeys even before HELLO, and print
-    that it is done. A simulated device is connected as usual."""
+    that it is done. Raises `InputError` for "sim", which would be a new device, at rest already."""
     from hilbo.device import messages
     from hilbo.device.link import Link
     from hilbo.device.ports import open_port
 
     if line.device == "sim":
-        with opened(line) as device:
-            getattr(device, name.lower())()
-    else:
-        link = Link(open_port(line.device, line.baud), patience=line.patience or 0.1)
-        try:
-            link.request(getattr(messages, name)())
-        finally:
-            link.close()
+        raise InputError(
+            f"--device is missing: `hilbo device {name.lower()}` would stop a new simulated device, and nothing that"
+            " moves; name the port, such as --device /dev/ttyACM0."
+        )
+    link = Link(open_port(line.device, line.baud), patience=line.patience or 0.1)
+    try:
+        link.request(getattr(messages, name)())
+    finally:
+        link.close()
     print_result({"done": name.lower()}, "done", as_json)

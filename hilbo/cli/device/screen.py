@@ -116,6 +116,7 @@ class _View:
         status = self.status
         return {
             "state": meaning(State, status.state),
+            "reason": held_because(status.hold_reason) if status.state >= State.HOLD else "",
             **{name: getattr(status, name) for name in _REPORTED},
             "samples": self.seen,
             "largest_force_N": self.largest_N,
@@ -125,9 +126,13 @@ class _View:
         }
 
 
-def watch(device: Renderer, seconds: float | None, title: str = "Ctrl-C ends") -> dict[str, Any]:
-    """Show the device until Ctrl-C, or for so many `seconds` of its time (None: without end); returns a summary."""
-    return _show(_View(device, title), seconds, lambda: True)
+def watch(
+    device: Renderer, seconds: float | None, title: str = "Ctrl-C ends", *, while_free: bool = False
+) -> dict[str, Any]:
+    """Show the device until Ctrl-C, or for so many `seconds` of its time (None: without end); `while_free`: only until
+    it is in HOLD or ESTOP. Returns a summary."""
+    view = _View(device, title)
+    return _show(view, seconds, lambda: not while_free or view.status.state < State.HOLD)
 
 
 def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float | None) -> dict[str, Any]:
