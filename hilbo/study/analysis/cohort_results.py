@@ -65,8 +65,8 @@ def analyse_cohort(
     """Aggregate a cohort and analyse the map; returns while a thread computes the optima after fewer trials.
 
     **Arguments:** `say`: called with a phrase at the start of each step; `tell`: called with sentences on the optimum
-    as soon as it is known; `whole`: False for the aggregate alone, as for many participants; `individuals`, `count`: as
-    `individuals` and `say` of `aggregate_cohort`.
+    as soon as it is known; `whole`: False for the map by the study's own rule and inference alone, as for many
+    participants; `individuals`, `count`: as `individuals` and `say` of `aggregate_cohort`.
     """
     if RULES[study.rule].learns:
         say("learning the hyperparameters from all answers")
@@ -77,7 +77,7 @@ def analyse_cohort(
         asked = asked_variance(map_, cohort)
         tell([optimum_sentence(study, optimum.x), *location_sentences(study, optimum.x, optimum.sd, asked)])
 
-    aggregate = aggregate_cohort(study, cohort, seed, first=first, individuals=individuals, say=count)
+    aggregate = aggregate_cohort(study, cohort, seed, whole, first, individuals=individuals, say=count)
     if not whole:
         return CohortResults(study, aggregate, None, seed, None, None)
     say("the optima after fewer trials")
