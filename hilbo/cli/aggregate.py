@@ -199,9 +199,11 @@ def _included(study, everybody) -> tuple[Any, list[str]]:
 
 
 def _whole(people: int, devices: int, individuals: bool, compare: bool) -> bool:
-    """Whether all analyses are computed, that is also the maps by other rules, the optima after fewer trials, the region
-    of the optimum and the model check: with individual optima, for up to `MANY` participants on one device. Raises `InputError` if `compare`
-    is asked for without them."""
+    """Whether all analyses are computed, that is also maps by other rules, the optima after fewer trials, the region of
+    the optimum and the model check: with individual optima, for up to `MANY` participants on one device.
+
+    Raises `InputError` if `compare` is asked for without them.
+    """
     from hilbo.study.estimate.aggregate import MANY
 
     whole = individuals and people <= MANY and devices == 1
