@@ -210,7 +210,7 @@ def test_record_and_decode(device, tmp_path):
         "byte": capture.stat().st_size - 4,
         "seq": None,
         "message": None,
-        "wrong": "no COBS: a run ends beyond the frame",
+        "wrong": "no COBS: a run ends beyond the frame, or has no length",
     }
     stdout = device("decode", capture)[1]
     assert "HELLO_REPLY" in stdout and "?  no COBS" in stdout
