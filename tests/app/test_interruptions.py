@@ -280,6 +280,18 @@ def test_what_the_device_did_is_written_once_before_the_session_ends(tried):
     assert hub.written == ["lost", "ready"]
 
 
+def test_a_disk_that_hangs_does_not_keep_the_device_from_being_stopped(monkeypatch):
+    async def ended(hub):
+        hub.alert, hub.commit = None, lambda make: asyncio.get_running_loop().create_future()
+        watch = Interruptions(hub)
+        watch.device_changed(Snapshot("LOST", False, "gone"))
+        await watch.end()
+
+    monkeypatch.setattr("hilbo.app.hub.interruptions._LATER", 0.05)
+    with pytest.raises(LogError, match=r"^The disk does not answer\. Not in the log: 1 change of the device"):
+        asyncio.run(asyncio.wait_for(ended(Disk(full=0)), 10))
+
+
 def test_what_the_device_did_and_cannot_be_written_is_said_at_the_end():
     """Once everything else has ended: the rig, and the threads."""
     closed = []

@@ -53,17 +53,20 @@ class Interruptions:
         self._spawn(self._watch("log", self.hub.check_log))
 
     async def end(self) -> None:
-        """Commit the device events that still wait for the disk, and cancel all watching. Raises `LogError` with how
-        many events are missing in the log, if they cannot be written."""
-        try:
-            await self._write()  # not after `cancel`, which leaves an event that is being written in the queue
-        finally:
-            for task in self._tasks:
-                task.cancel()
+        """Commit the device events that still wait for the disk, for at most `_LATER` s, and cancel all watching.
+
+        Raises `LogError` with how many events are missing in the log, if they could not be written.
+        """
+        # Not after `cancel`, which leaves an event that is being written in the queue. A disk that hangs does not keep
+        # the device from being stopped.
+        writing = asyncio.ensure_future(self._write())
+        await asyncio.wait([writing], timeout=_LATER)
+        for task in (writing, *self._tasks):
+            task.cancel()
         if self._unwritten:
-            missing = len(self._unwritten)
+            why, missing = self.hub.alert or "The disk does not answer.", len(self._unwritten)
             raise LogError(
-                f"{self.hub.alert} Not in the log: {missing} change{'s' * (missing > 1)} of the device, the last to"
+                f"{why} Not in the log: {missing} change{'s' * (missing > 1)} of the device, the last to"
                 f' "{self._condition}"; go on with --resume, and void the trial that it interrupted.'
             )
 
