@@ -34,7 +34,7 @@ from attacks.schedule_ground import PEOPLE, make_ground
 from attacks.support import main, scratch
 from hilbo.errors import InputError
 from hilbo.session.log.event_log import read_log
-from hilbo.study.disk.lock import JOURNAL
+from hilbo.study.disk.lock import JOURNAL, LOCK
 from hilbo.study.results.listing import LIST, digest, listed
 
 __all__ = ["schedule_case"]
@@ -191,13 +191,14 @@ class Schedule:
         self.gone = {words[3] for kind, words in made if kind == "delete"}
         self.commands = [Command(kind, words) for kind, words in made]
         self.left: set[str] = set()
+        self.tracebacks: list[str] = []
 
     def run(self, *, models: bool) -> list[str]:
         """What is wrong when all is done. `models`: also run the commands that fit models afterwards."""
         for attempt in range(AGAIN):
             self._round([c for c in self.commands if not c.is_done], at_once=attempt < 2)
         wrong = [f"never done: {c.words}: {c.said[-300:]}" for c in self.commands if not c.is_done]
-        wrong += [f"{' '.join(c.words)}: {c.said[-2000:]}" for c in self.commands if "Traceback" in c.said]
+        wrong += self.tracebacks
         return wrong or [*self._faults(), *self._afterwards(models)]
 
     def _round(self, commands: list[Command], *, at_once: bool) -> None:
@@ -219,6 +220,8 @@ class Schedule:
         status = ended(child)
         command.said = said.read_text(errors="replace")
         said.unlink()
+        if "Traceback" in command.said:
+            self.tracebacks.append(f"{' '.join(command.words)}: {command.said[-2000:]}")
         command.is_done = status == 0 or (status == 2 and any(words in command.said for words in DONE))
         if command.kind == "delete":
             self.left |= {line.split(": LEFT; ")[0].strip() for line in command.said.splitlines() if ": LEFT; " in line}
@@ -237,15 +240,8 @@ class Schedule:
     def _faults(self) -> Iterator[str]:
         """What is wrong with the files."""
         yield from self._traces()
+        yield from self._lost_rows()
         there = set(PEOPLE) - self.gone
-        for name in ("participants.csv", "trials.csv"):
-            rows = _table(self.study / name)
-            whole = _table(self.root / "whole" / name)
-            for person in there:
-                if [row for row in rows if row["participant"] == person] != [
-                    row for row in whole if row["participant"] == person
-                ]:
-                    yield f"{name} has lost rows of {person}"
         added = {c.words[3] for c in self.commands if c.kind == "add"}
         listed_people = {row["participant"] for row in _table(self.study / "participants.csv")}
         yield from (f"{person} is not in the list" for person in added - listed_people)
@@ -255,11 +251,19 @@ class Schedule:
         yield from (f"{person} is missing in the plan" for person in there - set(planned))
         yield from self._damages()
 
+    def _lost_rows(self) -> Iterator[str]:
+        """Tables that lack rows of somebody who is still in the study."""
+        for name in ("participants.csv", "trials.csv"):
+            now, before = _table(self.study / name), _table(self.root / "whole" / name)
+            for person in set(PEOPLE) - self.gone:
+                if _rows_of(person, now) != _rows_of(person, before):
+                    yield f"{name} has lost rows of {person}"
+
     def _damages(self) -> Iterator[str]:
         """Files that are not whole, and those that should not be there."""
-        for path in sorted(path for path in self.study.rglob("*") if path.is_file()):
+        for path in sorted(self.study.rglob("*")):
             name = path.relative_to(self.study)
-            if path.name == JOURNAL or path.suffix in (".part", ".old") or ".part" in path.name:
+            if path.name in (JOURNAL, LOCK) or path.suffix in (".part", ".old"):  # of files and of folders
                 yield f"{name} stays"
             elif path.suffix == ".json":
                 try:
@@ -294,6 +298,11 @@ def _table(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(path.read_text()))) if path.exists() else []
 
 
+def _rows_of(person: str, rows: list[dict[str, str]]) -> list[dict[str, str]]:
+    """The rows of one participant."""
+    return [row for row in rows if row["participant"] == person]
+
+
 def _bytes(path: Path) -> bytes:
     """The bytes of a file, and of what it compresses."""
     content = path.read_bytes()
@@ -320,7 +329,9 @@ def _node(node) -> bytes:
 
 def _preloaded() -> None:
     """Begin this process again with kill_before.c before the system's own functions."""
-    if "kill_before" in os.environ.get("LD_PRELOAD", ""):
+    if "kill_before" in (loaded := os.environ.get("LD_PRELOAD", "")):
+        del os.environ["LD_PRELOAD"]
+        shutil.rmtree(Path(loaded).parent)  # the processes that are forked have it in memory
         return
     library = Path(tempfile.mkdtemp(prefix="hilbo-preloaded-")) / "kill_before.so"
     source = Path(__file__).with_name("kill_before.c")
