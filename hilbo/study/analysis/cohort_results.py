@@ -77,7 +77,9 @@ def analyse_cohort(
         asked = asked_variance(map_, cohort)
         tell([optimum_sentence(study, optimum.x), *location_sentences(study, optimum.x, optimum.sd, asked)])
 
-    aggregate = aggregate_cohort(study, cohort, seed, whole, first, individuals=individuals, say=count)
+    aggregate = aggregate_cohort(
+        study, cohort, seed, alternatives=whole, first=first, individuals=individuals, say=count
+    )
     if not whole:
         return CohortResults(study, aggregate, None, seed, None, None)
     say("the optima after fewer trials")
