@@ -80,6 +80,18 @@ class Surface(eqx.Module):
         return predict_map(self.map, to_device(x))
 
 
+class Newcomer(eqx.Module):
+    """A new participant's latent function as a callable function of points."""
+
+    map: RuleMap
+
+    def __call__(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of the function at points of the unit cube. By hierarchical methods the variance
+        exceeds that of the map, which is the function that participants share."""
+        mean, variance = predict_map(self.map, to_device(x))
+        return mean, variance + self.map.apart
+
+
 class Aggregate(eqx.Module):
     """A study's posteriors, its population optimum by the study's method, and alternatives to compare with."""
 
@@ -145,11 +157,10 @@ class Aggregate(eqx.Module):
         """Probabilities (m, C) of a new participant's responses at points of the unit cube."""
         return class_probabilities(likelihood, *self.newcomer(x), self.map.widths)
 
-    def newcomer(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of a new participant's latent function at points of the unit cube. By hierarchical
-        methods the variance exceeds that of the map, which is the function that participants share."""
-        mean, variance = self.surface(x)
-        return mean, variance + self.map.apart
+    @property
+    def newcomer(self) -> Newcomer:
+        """A new participant's latent function, which may be passed to compiled programs, as `surface`."""
+        return Newcomer(self.map)
 
     @property
     def mean_of_optima(self) -> Float[Array, " d"]:
