@@ -199,6 +199,7 @@ def test_no_optima_of_people_are_sought_if_they_are_not_wanted(capsys, monkeypat
     assert content["mean_of_optima"] is None and content["alternatives"] == {}
     page = " ".join((out / "report.html").read_text().split())
     assert "Their own optima were not sought" in page and page.count("data:image/png;base64,") == 1
+    assert "Alternative estimates" not in page
     assert len(pd.read_csv(out / "optima.csv")) == 1
     small = json.loads(run(capsys, monkeypatch, "aggregate", *VIDEO, "--out", tmp_path / "small", *few)[1])
     assert content["optimum"]["unit"] == pytest.approx(small["optimum"]["unit"], abs=1e-6)
