@@ -36,7 +36,7 @@ MAY_IMPORT = {
     "population.rules": set(),
     "population.learnt": {"population.rules", "population.shared"},
     "population": {"bcm", "population.learnt"},
-    "population.judged": {"population"},
+    "population.judged": {"hyperparameters", "population"},
     "mechanics": {"numerics"},
     "viscoelastic": {"mechanics"},
     "passivity": {"viscoelastic"},

@@ -112,17 +112,14 @@ def robustness(
     study: StudyOption,
     out: Out,
     seed: Annotated[int, seed_option("of the points among which optima are sought")] = 0,
-    own: Annotated[
-        bool, typer.Option("--own", help="Each person's own hyperparameters instead of shared ones.")
-    ] = False,
     learn: Annotated[
-        str, typer.Option(help="What the evidence chooses of theta, noise and thresholds, separated by commas.")
+        str, typer.Option(help="Which of theta, noise and thresholds are optimised, separated by commas.")
     ] = "theta,noise,thresholds",
     material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Compare the optima with those of hyperparameters that maximise the evidence.
+    """Compare the optima with those under hyperparameters that maximise the evidence.
 
     Writes result.json, tables, figures and report.html to the folder --out.
     """
@@ -133,7 +130,7 @@ def robustness(
         from hilbo.study.analysis.robustness import robustness as check
 
         say("hyperparameters by maximum evidence")
-        comparison = check(chosen, cohort, seed, learn=tuple(name.strip() for name in learn.split(",")), shared=not own)
+        comparison = check(chosen, cohort, seed, learn=tuple(name.strip() for name in learn.split(",")))
         say("maps, figures and report")
         content = write_robustness(chosen, cohort, comparison, folder, seed, [*flagged, *left_out])
     finish(content, out, as_json)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.population.rules.recipes import WIDTHS
 
-__all__ = ["InTurn", "class_probabilities", "in_turn", "log_highest", "predicted_in_turn"]
+__all__ = ["InTurn", "class_probabilities", "in_turn", "log_highest", "predicted_in_turn", "with_variances"]
 
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
@@ -55,6 +55,12 @@ def log_highest(
     highest = jax.vmap(lambda w: _widened(likelihood, w)[-1])(_log_widths(mean))
     each = log_ndtr((mean[:, None] - highest[None, :]) / spread[:, None])
     return logsumexp(each, axis=1, b=jnp.asarray(_WEIGHTS, mean.dtype)[None, :])
+
+
+def with_variances(covariance: Float[Array, "m m"], variance: Float[Array, " m"]) -> Float[Array, "m m"]:
+    """Covariance matrix (m, m) with the correlations of `covariance` (m, m) and the variances `variance` (m,)."""
+    scale = jnp.sqrt(variance / jnp.diagonal(covariance))
+    return covariance * jnp.outer(scale, scale)
 
 
 class InTurn(NamedTuple):

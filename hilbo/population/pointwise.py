@@ -22,9 +22,10 @@ The sums are made of predictions (`aggregate`), or of posteriors, one participan
 import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hilbo import bcm
 from hilbo.errors import InputError
@@ -33,7 +34,7 @@ from hilbo.numerics.tracing import traced_once
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.rules.registry import POINTWISE, RULES
 
-__all__ = ["aggregate", "merged"]
+__all__ = ["aggregate", "merged", "merged_without"]
 
 
 class _Sums(NamedTuple):
@@ -84,10 +85,36 @@ def merged(
     hierarchical method, None for others. Nothing is checked. The predictions of the participants are made one after the
     other and are never all in memory, on each of the devices that participants are sharded over.
     """
-    prior = jnp.broadcast_to(jnp.asarray(prior_variance, x.dtype), x.shape[:1])
-    common_share = jnp.ones((), x.dtype) if share is None else jnp.asarray(share, x.dtype)
+    prior, common_share = _prior_and_share(x, prior_variance, share)
     sums = sum_over_people(_terms_of_person, experts, x, prior, common_share)
     return sums.merge(prior, jnp.asarray(experts.trials.mask.shape[0], x.dtype), rule, common_share)
+
+
+def merged_without(
+    rule: str,
+    experts: Posterior,
+    x: Float[Array, "m d"],
+    left_out: Int[Array, " m"],
+    prior_variance: ArrayLike,
+    share: ArrayLike | None = None,
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Mean and variance (m,) at points (m, d), at each of all participants but the one in row `left_out` (m,).
+
+    Other arguments as for `merged`; at least two participants.
+    """
+    prior, common_share = _prior_and_share(x, prior_variance, share)
+    people = experts.trials.mask.shape[0]
+    numbered = experts, jnp.arange(people)
+    sums = sum_over_people(_terms_of_other, numbered, x, left_out, prior, common_share)
+    return sums.merge(prior, jnp.asarray(people - 1, x.dtype), rule, common_share)
+
+
+def _prior_and_share(
+    x: Float[Array, "m d"], prior_variance: ArrayLike, share: ArrayLike | None
+) -> tuple[Float[Array, " m"], Float[Array, ""]]:
+    """Prior variance at each point, (m,), and the share p, 1 if it is None; in the dtype of the points."""
+    prior = jnp.broadcast_to(jnp.asarray(prior_variance, x.dtype), x.shape[:1])
+    return prior, jnp.ones((), x.dtype) if share is None else jnp.asarray(share, x.dtype)
 
 
 def _terms_of_person(
@@ -95,6 +122,19 @@ def _terms_of_person(
 ) -> _Sums:
     """What one participant's posterior adds to the sums at points (m, d); `prior` (m,), `share` a scalar."""
     return _terms(*person.predict_explained(x), prior, share)
+
+
+def _terms_of_other(
+    person: tuple[Posterior, Int[Array, ""]],
+    x: Float[Array, "m d"],
+    left_out: Int[Array, " m"],
+    prior: Float[Array, " m"],
+    share: Float[Array, ""],
+) -> _Sums:
+    """`_terms_of_person` of a posterior with its row, 0 at the points where that row is `left_out` (m,)."""
+    posterior, row = person
+    terms = _terms_of_person(posterior, x, prior, share)
+    return jax.tree.map(lambda term: jnp.where(left_out == row, 0.0, term), terms)
 
 
 def aggregate(

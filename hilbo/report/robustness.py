@@ -7,14 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from hilbo.hyperparameters.judged_evidence import judged_sentences
-from hilbo.population.rules.registry import RECOMMENDED
+from hilbo.population.rules.registry import RECOMMENDED, RULES
 from hilbo.report.page import Pictures, rendered
 from hilbo.report.result_file import write_result
 from hilbo.report.results import optimum_content, save_figures, versions
-from hilbo.study.analysis.robustness import LIMIT, Robustness
+from hilbo.study.analysis.robustness import LIMIT, NEAR, Place, Robustness
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.estimate.aggregate import Aggregate, Surface
+from hilbo.study.estimate.learnt import learnt_sentences
+from hilbo.study.estimate.location import location_notes
 from hilbo.study.formats.json_file import Content
 from hilbo.study.results.map_netcdf import map_dataset
 
@@ -35,7 +37,7 @@ def write_robustness(
     content = robustness_result(study, cohort, check, seed)
     content["warnings"] = [*left_out, *content["warnings"]]
     write_result(content, folder)
-    maps = [map_dataset(study, lambda x, of=of: of(jnp.asarray(x))) for of in check.maps()]
+    maps = [map_dataset(study, lambda x, of=of: of(jnp.asarray(x))) for of in _maps(check)]
     both = xr.concat(maps, xr.DataArray(["fixed", "by evidence"], dims="hyperparameters", name="hyperparameters"))
     both.to_netcdf(folder / "map.nc", engine="h5netcdf")
     pictures = save_figures(_figures(study, cohort, check), folder)
@@ -43,12 +45,17 @@ def write_robustness(
     return content
 
 
+def _maps(check: Robustness) -> tuple[Surface, Surface]:
+    """Population maps with fixed and with optimised hyperparameters."""
+    return check.fixed_aggregate.surface, check.optimised_aggregate.surface
+
+
 def robustness_page(study: Study, content: Content, figures: Pictures) -> str:
     """The page of the robustness check as HTML, with its figures inside. `content`: of `robustness_result`; `figures`:
     of `save_figures`.
     """
     # Of each hyperparameter a list of columns: how each parameter moves with it, in search ranges.
-    sensitivity = {name: np.atleast_2d(np.asarray(block).T) for name, block in content["sensitivity"].items()}
+    blocks = content["sensitivity"] or {}
     return rendered(
         "robustness.html",
         study=study,
@@ -56,14 +63,17 @@ def robustness_page(study: Study, content: Content, figures: Pictures) -> str:
         warnings=content["warnings"],
         figures=figures,
         limit=LIMIT,
+        near=NEAR,
+        top=study.responses[-1],
         recommended=RECOMMENDED,
-        sensitivity=sensitivity,
-        table=_table(content["learned"]) if content["learned"]["shared"] else None,
+        learns=RULES[study.rule].learns,
+        sensitivity={name: np.atleast_2d(np.asarray(block).T) for name, block in blocks.items()},
+        table=_table(content["learned"]),
     )
 
 
 def _table(learned: Content) -> str:
-    """The learnt hyperparameters as a [gp] table of a study file, TOML text with four significant digits."""
+    """The optimised hyperparameters as a [gp] table of a study file, TOML text with four significant digits."""
     names = ("theta", "variance", "thresholds", "noise")
     return "\n".join(["[gp]", *(f"{name} = {_four_digits(learned[name])}" for name in names)])
 
@@ -74,60 +84,68 @@ def _four_digits(value: float | list[float]) -> str:
 
 
 def _figures(study, cohort, check):
-    """Matplotlib figures: "maps", under fixed and under learnt hyperparameters, and "moves", shifts of the optima."""
+    """Matplotlib figures: "maps", under fixed and under optimised hyperparameters, and "moves", shifts of the
+    optima.
+    """
     from hilbo.report.figures import maps
 
-    fixed, optimised = check.maps()
+    fixed, optimised = _maps(check)
     both = {"fixed hyperparameters": fixed, "by maximum evidence": optimised}
+    best = np.stack([check.fixed.optimum.x, check.optimised.optimum.x])
     return {
-        "maps": maps.maps_beside(study, both, np.stack([check.fixed.x, check.optimised.x])),
-        "moves": maps.moved_optima(cohort.names, check.individual_nrmse, float(check.nrmse), LIMIT),
+        "maps": maps.maps_beside(study, both, best),
+        "moves": maps.moved_optima(cohort.names, check.individual_nrmse, check.nrmse, LIMIT),
     }
 
 
 def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int) -> Content:
     """The content of result.json of `hilbo robustness`, without excluded participants' sentences.
 
-    Both optima, their distance (NRMSE), that of each participant, the learnt hyperparameters, and the optimum's
-    derivatives by them. `seed`: only recorded.
+    The optima and their distances (NRMSE), that of each participant, the optimised hyperparameters and their criterion,
+    and the optimum's derivatives by them. `seed`: only recorded.
     """
-    maximum, people = check.maximum, len(cohort.names)
-    stacked = [np.broadcast_to(np.asarray(flags), (people,)) for flags in (maximum.converged, maximum.runaway)]
-    rows = [
-        {
-            "participant": name,
-            "nrmse": float(check.individual_nrmse[j]),
-            "flagged": bool(check.flagged_individuals[j]),
-            "converged": bool(stacked[0][j]),
-            "runaway": bool(stacked[1][j]),
-        }
-        for j, name in enumerate(cohort.names)
-    ]
-    model = maximum.gp
+    both = check.hyperparameters
+    model = both.optimised.gp
+    moves = zip(cohort.names, check.individual_nrmse.tolist(), strict=True)
+    resampled = check.resampled
     return {
-        "warnings": _warnings(check, stacked),
-        "fixed": optimum_content(study, check.fixed),
-        "optimised": optimum_content(study, check.optimised),
-        "nrmse": float(check.nrmse),
-        "flagged": bool(check.flagged),
-        "resampled": None if check.resampled is None else _percentiles(check.resampled),
-        "rule": check.rule,
-        "participants": rows,
+        "warnings": _warnings(check),
+        "fixed": _place_content(both.fixed, check.fixed_aggregate, check.fixed),
+        "optimised": _place_content(both.optimised, check.optimised_aggregate, check.optimised),
+        "local": _place_content(both.optimised, check.optimised_aggregate, check.local),
+        "fixed_again": _place_content(both.optimised, check.optimised_aggregate, check.fixed_again),
+        "nrmse": check.nrmse,
+        "local_nrmse": check.local_nrmse,
+        "flagged": check.flagged,
+        "resampled": None if resampled is None else _percentiles(resampled.fixed),
+        "resampled_moves": None if resampled is None else _percentiles(resampled.moves),
+        "rule": study.rule,
+        "participants": [{"participant": name, "nrmse": move, "flagged": move >= LIMIT} for name, move in moves],
         "learned": {
-            "parameters": list(maximum.learn),
-            "laplace_error": np.asarray(check.judged.error).tolist(),
-            "learnt_again": np.asarray(check.judged.again).tolist(),
-            "shared": check.shared,
+            "criterion": both.criterion,
+            "gain": both.gain,
+            "parameters": list(both.learn),
+            "converged": both.converged,
+            "runaway": both.runaway,
             "theta": np.asarray(model.kernel.theta).tolist(),
             "variance": np.asarray(model.kernel.variance).tolist(),
             "noise": np.asarray(model.likelihood.noise).tolist(),
             "thresholds": np.asarray(model.likelihood.thresholds).tolist(),
         },
-        "sensitivity": {name: np.asarray(block).tolist() for name, block in check.sensitivity.items()},
+        "sensitivity": check.sensitivity and {name: np.asarray(v).tolist() for name, v in check.sensitivity.items()},
         "study": study.file.hash,
         "seed": seed,
         "versions": versions(),
     }
+
+
+def _place_content(study: Study, aggregate: Aggregate, place: Place) -> Content:
+    """An optimum of an aggregate's map as an entry of result.json, with the responses near it, and whether it lies on a
+    limit or is an extrapolation.
+    """
+    near = {"answers": place.answers, "highest": place.highest}
+    location = location_notes(study, place.optimum.x, place.optimum.sd, aggregate.asked_variance)
+    return optimum_content(study, place.optimum) | {"near": near, "location": location}
 
 
 def _percentiles(draws):
@@ -135,14 +153,12 @@ def _percentiles(draws):
     return dict(zip(("median", "95 %"), np.percentile(draws, [50, 95]).tolist(), strict=True))
 
 
-def _warnings(check, stacked):
-    """Warnings about the learnt hyperparameters, as sentences: a correlation length below a tenth of a search range,
-    searches that did not converge or ran away, and an inaccurate Laplace evidence.
-
-    `stacked`: flags (M,) of converged and of runaway searches, of each participant.
+def _warnings(check):
+    """Warnings as sentences: a correlation length below a tenth of a search range, an optimised model by which the
+    highest response is nowhere near the likeliest, and a search that did not converge.
     """
-    converged, runaway = stacked
-    kernel = check.maximum.gp.kernel
+    both = check.hyperparameters
+    kernel = both.optimised.gp.kernel
     of_numbers = np.array(kernel.levels) == 0 if kernel.levels else ...
     theta = float(np.median(np.asarray(kernel.theta)[of_numbers]))
     alike = float(np.exp(-theta * _TENTH**2))
@@ -152,8 +168,11 @@ def _warnings(check, stacked):
             f"Under the learnt theta = {theta:.3g}, renderings a tenth of a search range apart have a correlation of"
             f" {alike:.2g}: the answers do not make a smooth map, and an optimum found with it says little."
         )
-    for state, words in ((~converged, "did not converge"), (runaway, "found no maximum of the evidence in reach")):
-        if state.any():
-            whose = "The search" if check.shared else f"{state.sum()} of {len(state)} searches"
-            sentences.append(f"{whose} for hyperparameters {words}.")
-    return sentences + judged_sentences(check.judged)
+    chances = np.asarray(check.optimised.optimum.class_probabilities)
+    if np.argmax(chances) != len(chances) - 1:
+        sentences.append(
+            f'Under the optimised hyperparameters "{both.optimised.responses[-1]}" is not the likeliest answer of a new'
+            f" participant even at the optimum ({100 * chances[-1]:.0f} %): these answers are too few or too"
+            " inconsistent to tell where it is."
+        )
+    return [*sentences, *both.limits, *learnt_sentences(both.optimised)]

@@ -1,7 +1,5 @@
 """Maximum evidence against SciPy on the independent reference, the model's freedoms, and derivatives of an optimum."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,11 +14,6 @@ from hilbo.hyperparameters import maximum_evidence as hyper
 from hilbo.hyperparameters.coordinates import coordinates_of, log_prior, model_at
 from hilbo.numerics.polytope import Polytope
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
-from hilbo.study.analysis.robustness import robustness
-from hilbo.study.cohort import Cohort
-from hilbo.study.config import Study
-from hilbo.study.estimate.aggregate import fit_cohort
-from hilbo.study.estimate.optimum import population_optimum, predict_people
 from tests.vectors.evidence import three
 
 
@@ -101,57 +94,6 @@ def test_the_prior_is_largest_at_its_centre():
     assert float(log_prior(gp, gp, every)) == 0.0
     away = eqx.tree_at(lambda g: g.likelihood.noise, gp, gp.likelihood.noise * np.e)
     assert float(log_prior(away, gp, every)) == pytest.approx(-0.5)
-
-
-@pytest.fixture(scope="module")
-def checked():
-    study = Study.load("hilbo/data/paper.toml")
-    rng = np.random.default_rng(3)
-    x = study.space.candidates(60, 1)
-    goal = np.array([0.15, 0.25, 0.2])
-    felt = np.linalg.norm((x - goal) / [0.15, 0.4, 0.3], axis=1) + 0.3 * rng.standard_normal(60)
-    q = (felt < 1.8).astype(int) + (felt < 1.0)
-    trials = jax.tree.map(lambda *a: jnp.stack(a), *[Trials.from_arrays(x[i::3], q[i::3], 25) for i in range(3)])
-    cohort = Cohort(trials, np.zeros((3, 25, 3)), ("A", "B", "C"))
-    return study, cohort, robustness(study, cohort)
-
-
-@pytest.mark.deep
-def test_robustness_compares_optima(checked):
-    _, _, result = checked
-    assert float(result.nrmse) == pytest.approx(float(np.sqrt(np.mean((result.fixed.x - result.optimised.x) ** 2))))
-    assert result.individual_nrmse.shape == (3,)
-    assert bool(result.flagged) == (float(result.nrmse) >= 0.03)
-    assert result.maximum.learn == ("theta", "noise", "thresholds")
-
-
-@pytest.mark.deep
-def test_robustness_is_that_of_the_studys_rule(checked):
-    study, cohort, result = checked
-    assert result.rule == "bcm" and result.shares == (None, None)
-    other = robustness(dataclasses.replace(study, rule="hierarchical"), cohort)
-    fixed, learnt = (float(share) for share in other.shares)
-    assert 0 < fixed < 1 and 0 < learnt < 1 and fixed != learnt
-    heights = predict_people(result.posteriors, other.fixed.x[None, :], "hierarchical", other.shares[0])[0]
-    assert float(other.fixed.mean) == pytest.approx(float(heights[0]), rel=1e-10)
-    assert float(jnp.abs(other.fixed.mean - result.fixed.mean)) > 1e-3
-    for of, optimum in zip(other.maps(), (other.fixed, other.optimised), strict=True):
-        assert float(of(optimum.x[None, :])[0][0]) == pytest.approx(float(optimum.mean), rel=1e-10)
-
-
-@pytest.mark.deep
-def test_the_optimum_moves_as_its_derivative_says(checked):
-    study, cohort, result = checked
-    candidates = jnp.asarray(study.space.candidates(4096, 0))
-    step = 0.02
-
-    def optimum(log_noise):
-        changed = eqx.tree_at(lambda s: s.gp.likelihood.noise, study, jnp.exp(jnp.asarray(log_noise)))
-        return population_optimum(changed, fit_cohort(changed, cohort), candidates).x
-
-    middle = float(jnp.log(study.gp.likelihood.noise))
-    moved = (optimum(middle + step) - optimum(middle - step)) / (2 * step)
-    np.testing.assert_allclose(result.sensitivity["noise"], moved, atol=1e-3)
 
 
 @pytest.mark.deep

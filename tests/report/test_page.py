@@ -88,46 +88,53 @@ def test_it_says_why_rules_were_not_compared():
     assert "--no-compare" in macro(False) and "it takes" not in macro(False)
 
 
-def robust(shared, nrmse, resampled=MappingProxyType({"median": 0.02, "95 %": 0.025})):
+def robust(nrmse, resampled=MappingProxyType({"median": 0.02, "95 %": 0.025}), sensitivity=None):
     """The page of a robustness check of two people, the second of whom moved."""
     study = plain_study(2)
     optimum = {"parameters": Rendering.at(study.space, np.full(2, 0.5)).shown, "mean": 1.0, "sd": 0.25}
-    still = {"participant": "A", "nrmse": 0.01, "flagged": False, "converged": True, "runaway": False}
-    learned = {"parameters": ["theta", "noise"], "shared": shared, "theta": [5.0, 1 / 3], "variance": 1.0}
-    learned |= {"noise": 0.5, "thresholds": [0.0]}
+    optimum |= {"class_probabilities": {"no": 0.25, "yes": 0.75}, "near": {"answers": 7, "highest": 5}, "location": []}
+    learned = {"parameters": ["theta", "noise"], "criterion": "the evidence", "gain": 12.3}
+    learned |= {"theta": [5.0, 1 / 3], "variance": 1.0, "noise": 0.5, "thresholds": [0.0]}
     content = {
         "warnings": ["a < b"],
         "fixed": optimum,
         "optimised": optimum,
+        "local": optimum,
+        "fixed_again": optimum | {"location": ["at the lowest u"]},
         "nrmse": nrmse,
+        "local_nrmse": 0.011,
         "flagged": nrmse >= 0.03,
         "resampled": resampled,
+        "resampled_moves": resampled,
         "rule": "bcm",
-        "participants": [still, still | {"participant": "B", "nrmse": 0.2, "flagged": True, "converged": False}],
+        "participants": [
+            {"participant": "A", "nrmse": 0.01, "flagged": False},
+            {"participant": "B", "nrmse": 0.2, "flagged": True},
+        ],
         "learned": learned,
-        "sensitivity": {"theta": [0.1, -0.2], "gaps": [[0.1, 0.2], [0.3, 0.4]]},
+        "sensitivity": sensitivity,
         "versions": VERSIONS,
     }
     return words(robustness_page(study, content, {}))
 
 
 def test_the_page_of_a_robustness_check():
-    page = robust(shared=True, nrmse=0.01)
-    assert (
-        "one set for all; learnt: theta, noise" in page and "1.0 % of the search ranges (NRMSE), less than 3 %:" in page
-    )
+    page = robust(0.01, sensitivity={"theta": [0.1, -0.2], "gaps": [[0.1, 0.2], [0.3, 0.4]]})
+    assert "optimised: theta, noise; 12.3 nats more" in page and "that maximise the evidence, with weak priors" in page
+    assert "1.0 % of the search ranges (NRMSE), less than 3 %:" in page
     table = "[gp] theta = [5.0, 0.3333] variance = 1.0 thresholds = [0.0] noise = 0.5"
     assert table in page and "a &lt; b" in page
-    assert "moved by 3 % or more: B." in page and "B 20.0 % flagged, search not converged" in page
+    assert "moved by 3 % or more: B." in page and "B 20.0 % flagged" in page
+    assert "1.1 % 1.00 ± 0.25 75 % 7 (5)" in page and "at the lowest u" in page
     assert "ln theta +1.00 % -2.00 %" in page and "ln gap 2 +2.00 % +4.00 %" in page
     assert "open by 2.0 % (median" in page and "so that the shift is within that sampling error" in page
-    own = robust(shared=False, nrmse=0.03)
-    assert "each person's own" in own.replace("&#39;", "'") and "[gp]" not in own
-    assert "which is 3 % or more: it is not robust" in own and "the shift is more than that" in own
+    moved = robust(0.03)
+    assert "which is 3 % or more: it is not robust" in moved and "the shift is more than that" in moved
+    assert "Sensitivity" not in moved
 
 
 def test_one_person_claims_no_sampling_error():
-    page = robust(shared=True, nrmse=0.01, resampled=None).replace("&#39;", "'")
+    page = robust(0.01, resampled=None).replace("&#39;", "'")
     assert "is not known: one person's answers tell nothing of sampling." in page and "sampling error" not in page
 
 

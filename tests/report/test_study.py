@@ -27,8 +27,8 @@ from hilbo.report.study.study_figures import comparison_figures
 from hilbo.report.validation import validate
 from hilbo.search.box import Parameter
 from hilbo.study.analysis.analysis import limits_of
+from hilbo.study.analysis.bootstrap import can_resample
 from hilbo.study.analysis.progress import Progress, _counts, _splits, _to_other_half
-from hilbo.study.analysis.robustness import _resampled
 from hilbo.study.analysis.tolerance import tolerance
 from hilbo.study.analysis.tolerance_intervals import tolerance_ends
 from hilbo.study.cohort import Cohort, cohort_of
@@ -168,7 +168,7 @@ def test_one_person_has_no_resamples():
     posteriors, x = fit_cohort(study, cohort), jnp.array([0.4, 0.5])
     ends = tolerance_ends(study, posteriors, x, "v", draws=5)
     assert np.isnan([*ends.low, *ends.high, ends.lost]).all()
-    assert _resampled(study, posteriors, x[None, :], x, "bcm", None, 0) is None
+    assert not can_resample(posteriors)
     row = dict(hyperparameters="fixed", parameter="v", draws_without=ends.lost, low_end="range", high_end="range")
     row |= dict(low=1.0, high=2.0, low_from=np.nan, low_to=np.nan, high_from=np.nan, high_to=np.nan)
     ((*_, low, low_draws, _, high_draws, without),) = _tolerances(pd.DataFrame([row]))

@@ -20,7 +20,6 @@ from hilbo.population.maps import learnt_map
 from hilbo.population.rules.registry import RECOMMENDED
 from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import to_table
-from hilbo.study.analysis.robustness import robustness
 from hilbo.study.cohort import Cohort, cohort_of, read_trials
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import aggregate_cohort
@@ -206,12 +205,6 @@ def test_a_table_without_the_column_with_an_empty_cell_or_too_many_levels_gets_o
     many["trial"] = np.arange(1, len(many) + 1)
     with pytest.raises(InputError, match="has 240 different texts; a random effect takes up to 200"):
         cohort_of(many.assign(clip=[f"at {row}" for row in range(len(many))]), study)
-
-
-def test_there_is_nothing_fixed_to_compare_with(table):
-    study = study_of()
-    with pytest.raises(InputError, match='the rule "learnt-1" has no fixed ones'):
-        robustness(study, cohort_of(read_trials(table, study), study))
 
 
 def test_another_rule_has_no_model_to_go_by(tmp_path, table, capsys, monkeypatch):

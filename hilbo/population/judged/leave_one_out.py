@@ -34,7 +34,7 @@ from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.learnt.posterior import Stated
 from hilbo.population.learnt.rule import Learnt, learn
 from hilbo.population.maps import RuleMap, learnt_map, rule_map
-from hilbo.population.newcomer import InTurn, predicted_in_turn
+from hilbo.population.newcomer import InTurn, predicted_in_turn, with_variances
 from hilbo.population.rules.registry import RECIPES
 
 __all__ = [
@@ -272,20 +272,13 @@ def _newcomer(
     of a random effect have its effect in common. `mask` (m,): False in rows without a response.
     """
     mean, variance = population_map.newcomer(x, context)
-    correlation, effects = _correlation(gram(gp.kernel, x, x)), population_map.effects
+    covariance, effects = gram(gp.kernel, x, x), population_map.effects
     if effects is not None and context is not None:
         apart = (1.0 - population_map.share) * population_map.prior
-        sd, of_context = jnp.sqrt(population_map.predict(x)[1] + apart), jnp.sqrt(effects.variance[context])
+        of_context = jnp.sqrt(effects.variance[context])
         together = jnp.where(context[:, None] == context[None, :], jnp.outer(of_context, of_context), 0.0)
-        correlation = _correlation(correlation * jnp.outer(sd, sd) + together)
-    covariance = correlation * jnp.outer(jnp.sqrt(variance), jnp.sqrt(variance))
-    return predicted_in_turn(gp.likelihood, mean, covariance, q, mask, population_map.widths)
-
-
-def _correlation(covariance: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Correlation matrix (m, m) of a covariance matrix."""
-    sd = jnp.sqrt(jnp.diagonal(covariance))
-    return covariance / jnp.outer(sd, sd)
+        covariance = with_variances(covariance, population_map.predict(x)[1] + apart) + together
+    return predicted_in_turn(gp.likelihood, mean, with_variances(covariance, variance), q, mask, population_map.widths)
 
 
 def _converged(map_: RuleMap) -> bool:

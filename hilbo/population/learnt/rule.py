@@ -43,6 +43,7 @@ __all__ = [
     "drawn_functions",
     "learn",
     "learnt_function",
+    "not_learnt",
 ]
 
 _FINE = 1e-3  # of the finite differences for the curvature
@@ -163,9 +164,30 @@ def learn(
     begun, problem = first_search(start, answers, stated, recipe)
     if near is not None and not bool(begun.cost.usable):
         return learn(trials, categories, stated, recipe)
-    search, problem, free, gain = _with_widths_if_worth(*searched(begun, problem, common), frozenset(start))
-    sd, covariance = _posterior_spread(search, problem, free)
-    model = model_at(search.coordinates, answers, stated, KERNELS[recipe.kernel])
+    chosen = _with_widths_if_worth(*searched(begun, problem, common), frozenset(start))
+    return _recorded(chosen, *_posterior_spread(chosen.search, chosen.problem, chosen.free), recipe)
+
+
+def not_learnt(trials: Trials, categories: int, stated: Stated = NOTHING, recipe: Recipe = LEARNT_1) -> Learnt:
+    """The model at the medians of the recipe's priors, with nothing learnt, to compare with `learn`.
+
+    Arguments, and the error raised without responses, as for `learn`; all people have the same widths.
+    """
+    if not np.asarray(trials.mask).any():
+        raise InputError(f"{recipe.name}: nobody gave an answer; at least one person's answers are needed.")
+    answers = tallied(trials, categories)
+    search, problem = first_search(
+        medians(answers, stated, recipe.priors, KERNELS[recipe.kernel]), answers, stated, recipe
+    )
+    nothing = jnp.zeros((0, 0), trials.x.dtype)
+    return _recorded(_Chosen(search, problem, frozenset(), 0.0), {}, nothing, recipe)
+
+
+def _recorded(chosen: "_Chosen", sd: Coordinates, covariance: Float[Array, "k k"], recipe: Recipe) -> Learnt:
+    """Result of a search, with the standard deviations and the covariance of its coordinates."""
+    search, problem, free, gain = chosen
+    answers = problem.answers
+    model = model_at(search.coordinates, answers, problem.stated, problem.kernel)
     left = unexplained(model.unit, answers, problem.pivots)
     return Learnt(
         recipe=recipe.name,
@@ -180,7 +202,7 @@ def learn(
         rank=jnp.asarray(len(problem.pivots.points)),
         left=left,
         converged=search.cost.usable & jnp.asarray(search.ended) & (left <= _ROUGH),
-        people=len(trials.mask),
+        people=len(answers.x),
     )
 
 

@@ -181,11 +181,12 @@ def _tables(analysis: Analysis, material: Material, content, people) -> dict[str
 
 def _optimised(analysis: Analysis) -> dict[str, Any]:
     """Hyperparameters of maximum evidence, and the shift of the optimum by them (NRMSE), for result.json."""
-    gp = analysis.maximum.gp
+    gp = analysis.hyperparameters.optimised.gp
     return {
         "theta": np.asarray(gp.kernel.theta).tolist(),
         "noise": float(gp.likelihood.noise),
         "thresholds": np.asarray(gp.likelihood.thresholds).tolist(),
+        "criterion": analysis.hyperparameters.criterion,
         "nrmse": moved_by_evidence(analysis),
     }
 
@@ -215,6 +216,7 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "tolerance": _tolerances(tables["tolerance"]),
         "people": _shown(tables["people"].drop(columns=["categories", "left_out"]), digits=_DIGITS),
         "moved": content["optimised"]["nrmse"],
+        "criterion": content["optimised"]["criterion"],
         "model_check": content["model_check"],
         "without": [
             name for name, reading in readings.items() if all(i is None for i, _ in reading.tolerances.values())

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from hilbo.population.rules.registry import RULES
 from hilbo.report.results import moved
 from hilbo.search.rendering import Rendering
 from hilbo.study.analysis.analysis import Analysis
@@ -99,10 +100,9 @@ def alternatives_table(analysis: Analysis) -> pd.DataFrame:
     study, aggregate = analysis.study, analysis.aggregate
     claims: dict[str, tuple[Any, Any]] = {"population": (aggregate.optimum.x, aggregate.optimum)}
     claims |= {f"population, {name}": (other.x, other) for name, other in aggregate.alternatives.items()}
-    claims["population, optimised hyperparameters"] = (
-        analysis.optimised.aggregate.optimum.x,
-        analysis.optimised.aggregate.optimum,
-    )
+    learns = RULES[study.rule].learns
+    other = (analysis.fixed if learns else analysis.optimised).aggregate.optimum
+    claims[f"population, {'medians of the priors' if learns else 'optimised hyperparameters'}"] = (other.x, other)
     claims["mean of the individual optima"] = (aggregate.mean_of_optima, None)
     if analysis.sets is not None:
         claims |= {name: (analysis.sets.x[i], None) for i, name in enumerate(("best", "mid", "worst"))}

@@ -32,8 +32,10 @@ def study_figures(
     chosen, cohort, aggregate, progress = analysis.study, analysis.cohort, analysis.aggregate, analysis.progress
     best, prior = np.asarray(aggregate.optimum.x), aggregate.map.map_prior
     references = {} if material.reference is None else {material.reference_name: material.reference}
-    own = f"learnt by {chosen.rule}" if RULES[chosen.rule].learns else "fixed hyperparameters"
-    regions = {own: analysis.fixed, "optimised hyperparameters": analysis.optimised}
+    learns = RULES[chosen.rule].learns
+    fixed = "medians of the priors" if learns else "fixed hyperparameters"
+    optimised = f"learnt by {chosen.rule}" if learns else "optimised hyperparameters"
+    regions = {fixed: analysis.fixed, optimised: analysis.optimised}
     map_, hatched = study.sets_on_map(chosen, aggregate.surface, analysis.sets, best, cohort, prior)
     figures = {
         "progression": study.posterior_progress(chosen, cohort, progress, study.typical_person(analysis)),

@@ -2,11 +2,10 @@
 
 Exclusion comes first: each participant's response quality is measured (`hilbo.population.judged.response_quality`), the
 study's rule is applied, and only then are responses aggregated. Then: the aggregate, the optima after fewer trials,
-best, mid and worst, tolerance intervals with the study's hyperparameters and with those of maximum marginal likelihood,
+best, mid and worst, tolerance intervals with fixed hyperparameters and with those of maximum evidence (`optimised`),
 with their bootstrap over participants. Results that these responses do not allow are sentences in `limits`, not errors.
 """
 
-import dataclasses
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -15,14 +14,13 @@ import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
-from hilbo.hyperparameters.judged_evidence import Judged, judged_sentences, maximise_judged
-from hilbo.hyperparameters.maximum_evidence import MaximumEvidence
 from hilbo.population.maps import RuleMap, learnt_map, point_rule
-from hilbo.population.rules.registry import DEFAULT, RECOMMENDED, RULES
+from hilbo.population.rules.registry import RECOMMENDED, RULES
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.analysis.cohort_results import CohortResults, Say, analyse_cohort
 from hilbo.study.analysis.heterogeneity import how_aggregated
+from hilbo.study.analysis.optimised import FixedAndOptimised, fixed_and_optimised
 from hilbo.study.analysis.progress import Progress
 from hilbo.study.analysis.rule_comparison import FEWEST, compare
 from hilbo.study.analysis.tolerance import Sets, Tolerance, best_mid_worst, tolerance
@@ -38,8 +36,6 @@ from hilbo.study.formats.json_file import Content
 
 __all__ = ["Analysis", "Reading", "analyse", "limits_of", "moved_by_evidence"]
 
-_LEARN = ("theta", "noise", "thresholds")
-
 
 class Reading(NamedTuple):
     """A population map with the tolerance interval of each parameter and the bootstrap of its ends."""
@@ -54,8 +50,10 @@ class Analysis(NamedTuple):
 
     population: CohortResults
     fixed: Reading
+    """With the study's hyperparameters; of a method that learns them, with the medians of its priors."""
     optimised: Reading
-    maximum: MaximumEvidence
+    """With those of maximum evidence; of a method that learns them, the study's own."""
+    hyperparameters: FixedAndOptimised
     sets: Sets | None
     people: pd.DataFrame
     """Response quality of all participants, also of those excluded."""
@@ -98,21 +96,19 @@ def analyse(
     population = _with_learnt(analyse_cohort(study, cohort, seed, say), seed, say)
     study, aggregate = population.study, population.aggregate
     say("hyperparameters by maximum evidence")
-    judged, optimised_study, optimised = _optimised(study, cohort, seed)
-    maximum = judged.maximum
+    both = fixed_and_optimised(study, cohort)
+    fixed, optimised = _aggregates(both, aggregate, seed)
     say("reading the maps")
     sets, sentences = _best_mid_worst(study, aggregate, seed)
     best = aggregate.optimum
     location = location_sentences(study, best.x, best.sd, aggregate.asked_variance)
     limits = (*location, *learnt_sentences(study), *limits_of(study, cohort), *sentences)
-    limits += (*_aggregated_otherwise(aggregate.map), *judged_sentences(judged))
-    if bool(maximum.runaway) or not bool(maximum.converged):
-        limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
+    limits += (*_aggregated_otherwise(aggregate.map), *both.limits)
     return Analysis(
         population,
-        _reading(study, aggregate, seed),
-        _reading(optimised_study, optimised, seed),
-        maximum,
+        _reading(both.fixed, fixed, seed),
+        _reading(both.optimised, optimised, seed),
+        both,
         sets,
         people,
         left_out,
@@ -179,21 +175,12 @@ def _with_learnt(population: CohortResults, seed: int, say: Say) -> CohortResult
     return population._replace(aggregate=beside)
 
 
-def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Judged, Study, Aggregate]:
-    """Hyperparameters of maximum marginal likelihood, the study with them (and a method for given hyperparameters), and
-    its aggregate."""
-    judged = maximise_judged(study.gp, cohort.trials, _LEARN, inference=study.inference)
-    maximum = judged.maximum
-    optimised_study = dataclasses.replace(study, gp=maximum.gp, rule=_given_rule(study.rule, cohort), learnt=None)
-    return judged, optimised_study, aggregate_cohort(optimised_study, cohort, seed, alternatives=False)
-
-
-def _given_rule(name: str, cohort: Cohort) -> str:
-    """The method itself, or the method with given hyperparameters that replaces one that learns them."""
-    if not RULES[name].learns:
-        return name
-    by_points = RULES[RULES[name].pointwise]
-    return by_points.name if np.sum(cohort.counts() > 0) >= by_points.least_people else DEFAULT
+def _aggregates(both: FixedAndOptimised, own: Aggregate, seed: int) -> tuple[Aggregate, Aggregate]:
+    """Aggregates with fixed and with optimised hyperparameters. `own`: the study's, which is one of them."""
+    studies = both.fixed, both.optimised
+    learns = RULES[both.fixed.rule].learns
+    other = aggregate_cohort(studies[not learns], own.cohort, seed, alternatives=False)
+    return (other, own) if learns else (own, other)
 
 
 def _reading(study: Study, aggregate: Any, seed: int) -> Reading:
@@ -240,7 +227,6 @@ def _aggregated_otherwise(map_: RuleMap) -> Iterator[str]:
 
 
 def moved_by_evidence(analysis: Analysis) -> float:
-    """NRMSE between the optima with the study's hyperparameters and with those of maximum marginal likelihood."""
-    return float(
-        nrmse(analysis.optimised.aggregate.optimum.x, analysis.aggregate.optimum.x, analysis.study.gp.kernel.levels)
-    )
+    """NRMSE between the optima with fixed hyperparameters and with those of maximum evidence."""
+    fixed, optimised = (reading.aggregate.optimum.x for reading in (analysis.fixed, analysis.optimised))
+    return float(nrmse(optimised, fixed, analysis.study.gp.kernel.levels))

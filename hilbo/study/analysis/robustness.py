@@ -1,190 +1,175 @@
-"""The paper's robustness check: do the optima move if the hyperparameters maximise the marginal likelihood?
+"""The paper's robustness check: does the population optimum move if the hyperparameters maximise the evidence?
 
-The population optimum and the individual optima are computed twice, with the study's fixed hyperparameters and with
-learnt ones (shared by all, or per participant), and compared in units of the search ranges (NRMSE). In addition, the
-derivative of the population optimum with respect to each hyperparameter shows its influence. Participants are
-aggregated by the study's method, point by point; the shared variance fraction of the hierarchical method is estimated
-again, and kept fixed for the derivative. For comparison with the shift, a bootstrap gives the sampling variation over
-participants.
+The criterion is that of the study's aggregation method (`optimised`). Both maps are by that method, with fixed and with
+optimised hyperparameters; both population optima, and the individual ones, are compared in units of the search ranges
+(NRMSE). Three places are described under the optimised map: its optimum, the local optimum nearest uphill of the fixed
+one, and the fixed optimum itself. A large move to a place of equal height is another peak; a large local move is
+another hill. A bootstrap over participants gives the sampling variation of the fixed optimum, and the moves in the same
+resamples. For methods with given hyperparameters the derivative of the fixed optimum by each of them is added.
 
 Paper, section IV-3: less than 3 %.
 """
 
 from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Float
 
 from hilbo.errors import InputError
-from hilbo.hyperparameters.judged_evidence import Judged, maximise_judged
-from hilbo.hyperparameters.maximum_evidence import MaximumEvidence, optimum_sensitivity
+from hilbo.hyperparameters.maximum_evidence import optimum_sensitivity
 from hilbo.numerics.tracing import program
-from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
-from hilbo.population.maps import point_rule, share_of
+from hilbo.ordinal_gp import Posterior, Trials, fit
+from hilbo.population.maps import point_rule
 from hilbo.population.rules.registry import RULES
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.analysis.bootstrap import can_resample, resampled_tops
+from hilbo.study.analysis.optimised import LEARNABLE, FixedAndOptimised, fixed_and_optimised
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.estimate.aggregate import fit_cohort
-from hilbo.study.estimate.optimum import Optimum, individual_optima, population_optimum, predict_people
+from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort
+from hilbo.study.estimate.optimum import Optimum, map_optimum, predict_people
 
-__all__ = ["LIMIT", "Robustness", "robustness"]
+__all__ = ["LIMIT", "NEAR", "Place", "Resampled", "Robustness", "robustness"]
 
-_LEARNABLE = ("theta", "noise", "thresholds")
 _POINTS = 1000  # among which the optimum of resampled people is sought
 LIMIT = 0.03
 """NRMSE from which an optimum is flagged as not robust (paper, section IV-3)."""
+NEAR = 0.1
+"""NRMSE up to which a response counts as one near an optimum."""
 
 
-class Robustness(eqx.Module):
-    """Optima with fixed and with learnt hyperparameters, and the distances between them."""
+class Place(NamedTuple):
+    """An optimum, and the responses given within `NEAR` of it: their number, and how many were the highest."""
 
-    judged: Judged
-    """Learnt hyperparameters, one model if `shared`, otherwise stacked per participant; and the error of the Laplace
-    approximation there."""
-    fixed: Optimum
-    optimised: Optimum
-    fixed_individuals: Optimum
-    optimised_individuals: Optimum
-    posteriors: Posterior
-    """All participants' posteriors with the fixed hyperparameters."""
-    optimised_posteriors: Posterior
-    """All participants' posteriors with the learnt hyperparameters."""
-    nrmse: Float[Array, ""]
-    """NRMSE between the population optima."""
-    individual_nrmse: Float[Array, " M"]
-    resampled: Float[Array, " draws"] | None
-    """NRMSE of the population optimum of each bootstrap resample to that of all participants, fixed hyperparameters;
-    None with fewer than two participants."""
-    sensitivity: dict[str, Float[Array, "..."]]
-    """d(population optimum, unit cube) / d(log theta, log noise, first threshold, log gaps) at the fixed values."""
-    shared: bool = eqx.field(static=True)
-    rule: str = eqx.field(static=True)
-    """Aggregation method, point by point: the study's, or its counterpart if that takes all responses at once."""
-    shares: tuple[Float[Array, ""] | None, Float[Array, ""] | None]
-    """Shared variance fraction of the hierarchical method, with fixed and with learnt hyperparameters; otherwise
-    None."""
+    optimum: Optimum
+    answers: int
+    highest: int
+
+
+class Resampled(NamedTuple):
+    """NRMSE in resamples of the participants, (draws,) each: of the optimum with fixed hyperparameters to that of all
+    participants, and of the optimum with optimised hyperparameters to that with fixed ones in the same resample.
+    """
+
+    fixed: Float[np.ndarray, " draws"]
+    moves: Float[np.ndarray, " draws"]
+
+
+class Robustness(NamedTuple):
+    """Optima with fixed and with optimised hyperparameters, and the distances between them.
+
+    `fixed`: under the fixed map; `optimised`, `local` and `fixed_again` under the optimised one: its optimum, the local
+    one uphill of the fixed optimum, and the fixed optimum. `nrmse`, `local_nrmse`: of the optimised and of the local
+    optimum to the fixed one; `individual_nrmse` (M,); `resampled`: None with fewer than two participants;
+    `sensitivity`: d(fixed optimum, unit cube) / d(log theta, log noise, first threshold, log gaps), None for a method
+    that learns them.
+    """
+
+    hyperparameters: FixedAndOptimised
+    fixed_aggregate: Aggregate
+    optimised_aggregate: Aggregate
+    fixed: Place
+    optimised: Place
+    local: Place
+    fixed_again: Place
+    nrmse: float
+    local_nrmse: float
+    individual_nrmse: Float[np.ndarray, " M"]
+    resampled: Resampled | None
+    sensitivity: dict[str, Float[Array, "..."]] | None
 
     @property
-    def maximum(self) -> MaximumEvidence:
-        """The learnt hyperparameters and their convergence diagnostics."""
-        return self.judged.maximum
-
-    def maps(self) -> tuple[partial, partial]:
-        """The population maps with fixed and with learnt hyperparameters: functions of points (m, d) of the unit cube
-        that return mean and variance (m,)."""
-        both = zip((self.posteriors, self.optimised_posteriors), self.shares, strict=True)
-        fixed, learnt = (partial(predict_people, posteriors, rule=self.rule, share=share) for posteriors, share in both)
-        return fixed, learnt
-
-    @property
-    def flagged(self) -> Bool[Array, ""]:
-        """Whether the population optimum moves by 3 % of the search ranges or more, a scalar."""
+    def flagged(self) -> bool:
+        """Whether the population optimum moves by 3 % of the search ranges or more."""
         return self.nrmse >= LIMIT
 
-    @property
-    def flagged_individuals(self) -> Bool[Array, " M"]:
-        """Mask of the participants whose optimum moves by 3 % of the search ranges or more."""
-        return self.individual_nrmse >= LIMIT
 
-
-def robustness(
-    study: Study,
-    cohort: Cohort,
-    seed: int = 0,
-    *,
-    learn: Sequence[str] = _LEARNABLE,
-    shared: bool = True,
-    weak_priors: bool = True,
-) -> Robustness:
+def robustness(study: Study, cohort: Cohort, seed: int = 0, *, learn: Sequence[str] = LEARNABLE) -> Robustness:
     """Repeat the paper's robustness check for a cohort.
 
-    `learn`: hyperparameters to learn, of "theta", "noise" and "thresholds". `shared`: one set for all participants,
-    otherwise one for each. `weak_priors` keep the learnt values finite if 25 ordinal responses do not
-    (`maximum.runaway` marks those that diverged even so). Raises InputError for another hyperparameter, and for a study
-    whose method learns them itself.
+    `learn`: hyperparameters to optimise, of "theta", "noise" and "thresholds"; a method that learns hyperparameters
+    learns all. Raises `InputError` for another hyperparameter.
     """
-    _check(study, learn)
-    candidates = search_points(study.space, seed)
-    posteriors = fit_cohort(study, cohort)
-    judged = maximise_judged(
-        study.gp, cohort.trials, learn, shared=shared, weak_priors=weak_priors, inference=study.inference
-    )
-    optimised_study, again = _refitted(study, cohort, judged.maximum.gp, shared)
-    rule, share = point_rule(study.rule, _share(study, cohort))
-    shares = share, None if share is None else _share(optimised_study, cohort)
+    _check(learn)
+    both = fixed_and_optimised(study, cohort, tuple(learn))
     fixed, optimised = (
-        population_optimum(s, p, candidates, rule, share)
-        for s, p, share in zip((study, optimised_study), (posteriors, again), shares, strict=True)
+        aggregate_cohort(chosen, cohort, seed, alternatives=False) for chosen in (both.fixed, both.optimised)
     )
-    levels = study.gp.kernel.levels
-    before, after = (individual_optima(s, p, candidates) for s, p in ((study, posteriors), (optimised_study, again)))
+    levels, best = study.gp.kernel.levels, fixed.optimum.x
+    there = partial(map_optimum, both.optimised, optimised.map)
+    local = there(best[None, :])
+    place = partial(_place, cohort=cohort, levels=levels)
     return Robustness(
-        judged=judged,
-        fixed=fixed,
-        optimised=optimised,
-        fixed_individuals=before,
-        optimised_individuals=after,
-        posteriors=posteriors,
-        optimised_posteriors=again,
-        nrmse=nrmse(optimised.x, fixed.x, levels),
-        individual_nrmse=nrmse(after.x, before.x, levels),
-        resampled=_resampled(study, posteriors, candidates, fixed.x, rule, share, seed),
-        sensitivity=_sensitivity(study, cohort.trials, fixed.x, tuple(learn), rule, share),
-        shared=shared,
-        rule=rule,
-        shares=shares,
+        hyperparameters=both,
+        fixed_aggregate=fixed,
+        optimised_aggregate=optimised,
+        fixed=place(fixed.optimum),
+        optimised=place(optimised.optimum),
+        local=place(local),
+        fixed_again=place(_at(both.optimised, optimised, best)),
+        nrmse=float(nrmse(optimised.optimum.x, best, levels)),
+        local_nrmse=float(nrmse(local.x, best, levels)),
+        individual_nrmse=np.asarray(nrmse(optimised.individuals.x, fixed.individuals.x, levels)),
+        resampled=_resampled((both.fixed, fixed), (both.optimised, optimised), seed),
+        sensitivity=None if RULES[study.rule].learns else _sensitivity_of(study, fixed, tuple(learn)),
     )
 
 
-def _check(study: Study, learn: Sequence[str]) -> None:
-    """Raise InputError for hyperparameters that cannot be learnt here, and for a study without fixed ones."""
+def _check(learn: Sequence[str]) -> None:
+    """Raise InputError for hyperparameters that cannot be optimised here, and for none."""
     if "variance" in learn:
         raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
-    if unknown := [name for name in learn if name not in _LEARNABLE]:
-        raise InputError(f'robustness: asked to learn "{unknown[0]}"; choose from {", ".join(_LEARNABLE)}.')
-    if RULES[study.rule].learns:
-        raise InputError(
-            f'robustness: compares fixed hyperparameters with learnt ones, and the rule "{study.rule}" has no fixed'
-            " ones; its result.json has their intervals."
-        )
+    unknown = [name for name in learn if name not in LEARNABLE]
+    if unknown or not learn:
+        asked = f'"{unknown[0]}"' if unknown else "nothing"
+        raise InputError(f"robustness: asked to learn {asked}; choose from {', '.join(LEARNABLE)}.")
 
 
-def _refitted(study: Study, cohort: Cohort, gp: OrdinalGP, shared: bool) -> tuple[Study, Posterior]:
-    """Refit with learnt hyperparameters `gp`; returns the study with them (unchanged unless `shared`), and the
-    posteriors."""
-    if not shared:
-        return study, fit_cohort(study, cohort, gp)
-    learnt = eqx.tree_at(lambda s: s.gp, study, gp)
-    return learnt, fit_cohort(learnt, cohort)
+def _at(study: Study, aggregate: Aggregate, x: Float[Array, " d"]) -> Optimum:
+    """The map at a point (d,) in the form of an optimum."""
+    mean, variance = aggregate.surface(x[None, :])
+    return Optimum(x, mean[0], jnp.sqrt(variance[0]), aggregate.class_probabilities(study.gp.likelihood, x[None, :])[0])
 
 
-def _resampled(
-    study: Study,
-    posteriors: Posterior,
-    candidates: Float[Array, "m d"],
-    x: Float[Array, " d"],
-    rule: str,
-    share: Float[Array, ""] | None,
-    seed: int,
-) -> Float[Array, " draws"] | None:
-    """Bootstrap over participants: NRMSE of each resample's optimum, among x and 1000 candidates, to x. None for fewer
-    than two participants with responses."""
-    if not can_resample(posteriors):
+def _place(optimum: Optimum, cohort: Cohort, levels: tuple[int, ...]) -> Place:
+    """An optimum with the number of responses near it."""
+    mask = np.asarray(cohort.trials.mask)
+    away = np.asarray(nrmse(np.asarray(cohort.trials.x), np.asarray(optimum.x), levels))
+    answers = np.asarray(cohort.trials.q)[mask & (away <= NEAR)]
+    return Place(optimum, len(answers), int(np.sum(answers == optimum.class_probabilities.size - 1)))
+
+
+def _resampled(fixed: tuple[Study, Aggregate], optimised: tuple[Study, Aggregate], seed: int) -> Resampled | None:
+    """Bootstrap over participants: the optima of each resample, among 1000 candidates and the optimum of all, with the
+    hyperparameters of all, point by point. None for fewer than two participants with responses."""
+    study, aggregate = fixed
+    if not can_resample(aggregate.posteriors):
         return None
-    points = jnp.concatenate([x[None, :], candidates[:_POINTS]])
-    tops = resampled_tops(posteriors, points, rule, share, study.gp.kernel.variance, seed)
-    return nrmse(points[tops], x[None, :], study.gp.kernel.levels)
+    candidates, levels = search_points(study.space, seed)[:_POINTS], study.gp.kernel.levels
+    tops = [_tops(*each, candidates, seed) for each in (fixed, optimised)]
+    away = nrmse(tops[0], np.asarray(aggregate.optimum.x), levels)
+    return Resampled(np.asarray(away), np.asarray(nrmse(tops[1], tops[0], levels)))
 
 
-def _share(study: Study, cohort: Cohort) -> Float[Array, ""] | None:
-    """Shared variance fraction estimated from the cohort, if the study's method uses it; otherwise None."""
-    return share_of(study.gp, cohort.trials, study.inference).mean if RULES[study.rule].learns_share else None
+def _tops(
+    study: Study, aggregate: Aggregate, candidates: Float[Array, "m d"], seed: int
+) -> Float[np.ndarray, "draws d"]:
+    """Optimum of each resample of the participants, among the candidates and the optimum of all, (draws, d)."""
+    points = jnp.concatenate([aggregate.optimum.x[None, :], candidates])
+    rule, share = point_rule(study.rule, aggregate.map.share)
+    tops = resampled_tops(aggregate.posteriors, points, rule, share, study.gp.kernel.variance, seed)
+    return np.asarray(points)[tops]
+
+
+def _sensitivity_of(study: Study, aggregate: Aggregate, learn: tuple[str, ...]) -> dict[str, Float[Array, "..."]]:
+    """Derivatives of the fixed optimum by the hyperparameters `learn`, of participants aggregated point by point."""
+    rule, share = point_rule(study.rule, aggregate.map.share)
+    return _sensitivity(study, aggregate.cohort.trials, aggregate.optimum.x, learn, rule, share)
 
 
 @program
@@ -201,7 +186,7 @@ def _sensitivity(
     def refit(gp):
         return jax.vmap(lambda t: fit(gp, t, inference=study.inference, throw=False))(trials)
 
-    def height(w, posteriors):
+    def height(w, posteriors: Posterior):
         return predict_people(posteriors, study.space.from_box(w)[None, :], rule, share)[0][0]
 
     box, searched = study.space.to_box(x), study.space.searched

@@ -1,0 +1,93 @@
+"""Search for the hyperparameters of one model for all participants, by L-BFGS-B in unconstrained coordinates."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hilbo.ordinal_gp import OrdinalGP
+
+__all__ = ["RUNAWAY", "Cost", "End", "Maximum", "descended"]
+
+_STEPS = 200
+_NEAR = 1e-3  # nats that a step must gain for another
+RUNAWAY = 6.9
+"""Largest change of a coordinate that counts as a maximum: a factor of 1000."""
+
+
+class Maximum(NamedTuple):
+    """Model with the hyperparameters that maximise an evidence with weak priors, and the outcome of the search.
+
+    `log_evidence` is without the weak priors, `log_evidence_before` that of the model where the search started;
+    `runaway`: a hyperparameter changed by more than a factor 1000.
+    """
+
+    gp: OrdinalGP
+    log_evidence: float
+    log_evidence_before: float
+    steps: int
+    converged: bool
+    runaway: bool
+
+
+class Cost(NamedTuple):
+    """Minus log evidence and log prior at some coordinates, its gradient (p,), the log evidence, and whether all fits
+    converged.
+    """
+
+    value: Float[Array, ""]
+    gradient: Float[Array, " p"]
+    log_evidence: Float[Array, ""]
+    converged: Bool[Array, ""]
+
+
+class End(NamedTuple):
+    """End of one search: the lowest cost that it met, its coordinates and log evidence, evaluations, and whether it
+    converged with all fits.
+    """
+
+    cost: float
+    place: Float[np.ndarray, " p"]
+    log_evidence: float
+    steps: int
+    converged: bool
+
+
+def descended(
+    cost: Callable[[Float[np.ndarray, " p"]], Cost],
+    begin: Float[np.ndarray, " p"],
+    bounds: list[tuple[float, float]] | None = None,
+) -> End:
+    """Minimise a cost by L-BFGS-B from `begin` (p,), within `bounds`.
+
+    A cost or gradient that is not finite ends the search, which then has not converged; the cost is infinite if it was
+    so at the start.
+    """
+    from scipy.optimize import minimize  # a fifth of a second, which commands that learn nothing need not wait
+
+    best = End(np.inf, begin, -np.inf, 0, False)
+
+    def evaluated(place: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " p"]]:
+        nonlocal best
+        here = cost(place)
+        value, slope, steps = float(here.value), np.asarray(here.gradient, float), best.steps + 1
+        if not (np.isfinite(value) and np.all(np.isfinite(slope))):
+            raise _NotFiniteError
+        if value < best.cost:
+            best = End(value, place.copy(), float(here.log_evidence), steps, bool(here.converged))
+        best = best._replace(steps=steps)
+        return value, slope
+
+    try:
+        near = _NEAR / max(1.0, abs(evaluated(begin)[0]))  # SciPy's is a part of the cost
+        options = {"maxiter": _STEPS, "ftol": near, "gtol": 1e-3}
+        end = minimize(evaluated, begin, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        ended = bool(end.success)
+    except _NotFiniteError:  # L-BFGS-B would take an infinite cost for its end
+        ended = False
+    return best._replace(converged=best.converged and ended)
+
+
+class _NotFiniteError(Exception):
+    """Raised within a descent where the cost, or its gradient, is not finite."""
