@@ -118,7 +118,7 @@ def table(rows):
         "|---|---|---:|---:|---:|---:|---:|---:|",
     ]
     for key, (rule, criterion) in CRITERIA.items():
-        of = [row["by"] for row in rows if key in row["by"]]
+        of = [row["by"] for row in rows if key in row["by"] and (key != FIXED or not row["pooled"])]
         if of:
             fixed = FIXED if rule == "bcm" else f"{FIXED}, {rule}"
             lines.append("| " + " | ".join(cells(of, key, fixed, rule, criterion)) + " |")

@@ -113,7 +113,7 @@ def robustness(
     out: Out,
     seed: Annotated[int, seed_option("of the points among which optima are sought")] = 0,
     learn: Annotated[
-        str, typer.Option(help="Which of theta, noise and thresholds are optimised, separated by commas.")
+        str, typer.Option(help="Optimised hyperparameters, separated by commas; a rule that learns them learns all.")
     ] = "theta,noise,thresholds",
     material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
     force: Force = False,

@@ -100,12 +100,13 @@ def merged_without(
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Mean and variance (m,) at points (m, d), at each of all participants but the one in row `left_out` (m,).
 
-    Other arguments as for `merged`; at least two participants.
+    Other arguments as for `merged`; at least two participants. A derivative takes the memory of one
+    participant's terms.
     """
     prior, common_share = _prior_and_share(x, prior_variance, share)
     people = experts.trials.mask.shape[0]
     numbered = experts, jnp.arange(people)
-    sums = sum_over_people(_terms_of_other, numbered, x, left_out, prior, common_share)
+    sums = sum_over_people(jax.checkpoint(_terms_of_other), numbered, x, left_out, prior, common_share)
     return sums.merge(prior, jnp.asarray(people - 1, x.dtype), rule, common_share)
 
 

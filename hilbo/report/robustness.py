@@ -11,6 +11,7 @@ from hilbo.population.rules.registry import RECOMMENDED, RULES
 from hilbo.report.page import Pictures, rendered
 from hilbo.report.result_file import write_result
 from hilbo.report.results import optimum_content, save_figures, versions
+from hilbo.study.analysis.heterogeneity import how_aggregated
 from hilbo.study.analysis.robustness import LIMIT, NEAR, Place, Robustness
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
@@ -68,7 +69,8 @@ def robustness_page(study: Study, content: Content, figures: Pictures) -> str:
         recommended=RECOMMENDED,
         learns=RULES[study.rule].learns,
         sensitivity={name: np.atleast_2d(np.asarray(block).T) for name, block in blocks.items()},
-        table=_table(content["learned"]),
+        how=content["aggregated"],
+        table=None if study.gp.kernel.levels else _table(content["learned"]),
     )
 
 
@@ -112,7 +114,7 @@ def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int
         "warnings": _warnings(check),
         "fixed": _place_content(both.fixed, check.fixed_aggregate, check.fixed),
         "optimised": _place_content(both.optimised, check.optimised_aggregate, check.optimised),
-        "local": _place_content(both.optimised, check.optimised_aggregate, check.local),
+        "local": check.local and _place_content(both.optimised, check.optimised_aggregate, check.local),
         "fixed_again": _place_content(both.optimised, check.optimised_aggregate, check.fixed_again),
         "nrmse": check.nrmse,
         "local_nrmse": check.local_nrmse,
@@ -120,6 +122,7 @@ def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int
         "resampled": None if resampled is None else _percentiles(resampled.fixed),
         "resampled_moves": None if resampled is None else _percentiles(resampled.moves),
         "rule": study.rule,
+        "aggregated": how_aggregated(check.fixed_aggregate.map),
         "participants": [{"participant": name, "nrmse": move, "flagged": move >= LIMIT} for name, move in moves],
         "learned": {
             "criterion": both.criterion,
@@ -148,6 +151,17 @@ def _place_content(study: Study, aggregate: Aggregate, place: Place) -> Content:
     return optimum_content(study, place.optimum) | {"near": near, "location": location}
 
 
+def _correlation(study: Study) -> float:
+    """Correlation of the latent function a tenth of a search range apart, the median over numeric parameters; 1 without
+    any.
+    """
+    kernel, middle = study.gp.kernel, np.full(study.space.dim, 0.5)
+    numeric = [i for i, parameter in enumerate(study.space.parameters) if not parameter.levels]
+    steps = _TENTH * np.eye(study.space.dim)[numeric]
+    pairs = [kernel(jnp.asarray(middle), jnp.asarray(middle + step)) / kernel.variance for step in steps]
+    return float(np.median(pairs)) if pairs else 1.0
+
+
 def _percentiles(draws):
     """Median and 95th percentile of numbers, under the keys "median" and "95 %"."""
     return dict(zip(("median", "95 %"), np.percentile(draws, [50, 95]).tolist(), strict=True))
@@ -155,24 +169,19 @@ def _percentiles(draws):
 
 def _warnings(check):
     """Warnings as sentences: a correlation length below a tenth of a search range, an optimised model by which the
-    highest response is nowhere near the likeliest, and a search that did not converge.
+    highest response is nowhere the likeliest, and a search that did not converge.
     """
     both = check.hyperparameters
-    kernel = both.optimised.gp.kernel
-    of_numbers = np.array(kernel.levels) == 0 if kernel.levels else ...
-    theta = float(np.median(np.asarray(kernel.theta)[of_numbers]))
-    alike = float(np.exp(-theta * _TENTH**2))
-    sentences = []
+    alike, sentences = _correlation(both.optimised), []
     if alike < _UNRELATED:
         sentences.append(
-            f"Under the learnt theta = {theta:.3g}, renderings a tenth of a search range apart have a correlation of"
+            f"Under the optimised hyperparameters renderings a tenth of a search range apart have a correlation of"
             f" {alike:.2g}: the answers do not make a smooth map, and an optimum found with it says little."
         )
     chances = np.asarray(check.optimised.optimum.class_probabilities)
     if np.argmax(chances) != len(chances) - 1:
         sentences.append(
             f'Under the optimised hyperparameters "{both.optimised.responses[-1]}" is not the likeliest answer of a new'
-            f" participant even at the optimum ({100 * chances[-1]:.0f} %): these answers are too few or too"
-            " inconsistent to tell where it is."
+            f" participant, even at the optimum ({100 * chances[-1]:.0f} %)."
         )
     return [*sentences, *both.limits, *learnt_sentences(both.optimised)]

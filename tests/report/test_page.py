@@ -107,6 +107,7 @@ def robust(nrmse, resampled=MappingProxyType({"median": 0.02, "95 %": 0.025}), s
         "resampled": resampled,
         "resampled_moves": resampled,
         "rule": "bcm",
+        "aggregated": "",
         "participants": [
             {"participant": "A", "nrmse": 0.01, "flagged": False},
             {"participant": "B", "nrmse": 0.2, "flagged": True},

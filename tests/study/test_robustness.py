@@ -12,6 +12,7 @@ from hilbo.errors import InputError
 from hilbo.hyperparameters.maximum_evidence import maximise_evidence
 from hilbo.ordinal_gp import Trials, fit
 from hilbo.population.judged.left_out_evidence import left_out_evidence
+from hilbo.search.candidates import search_points
 from hilbo.study.analysis.optimised import fixed_and_optimised
 from hilbo.study.analysis.robustness import NEAR, robustness
 from hilbo.study.cohort import Cohort
@@ -53,6 +54,32 @@ def test_the_optima_are_compared(checked):
     assert float(optimised.mean) >= float(result.local.optimum.mean) >= float(result.fixed_again.optimum.mean)
     np.testing.assert_array_equal(result.fixed_again.optimum.x, fixed.x)
     assert result.resampled.fixed.shape == result.resampled.moves.shape
+
+
+def test_an_exact_map_is_compared_as_it_is(scene):
+    """Its sensitivity is that of the optimum of participants who are aggregated point by point."""
+    study, cohort = scene
+    result = robustness(dataclasses.replace(study, rule="pooled"), cohort, learn=("noise",))
+    posteriors, candidates = fit_cohort(study, cohort), search_points(study.space, 0)
+    top = population_optimum(study, posteriors, candidates).x
+    assert float(jnp.max(jnp.abs(top - result.fixed.optimum.x))) > 0.01
+    expected = robustness(study, cohort, learn=("noise",)).sensitivity["noise"]
+    np.testing.assert_allclose(result.sensitivity["noise"], expected, atol=1e-6)
+    assert float(np.min(result.resampled.fixed)) == 0.0
+
+
+def test_exact_inference_has_no_derivatives_and_is_checked_by_ep(scene):
+    study, cohort = scene
+    result = robustness(dataclasses.replace(study, inference="exact"), cohort, learn=("noise",))
+    by_ep = robustness(dataclasses.replace(study, inference="ep"), cohort, learn=("noise",))
+    assert result.hyperparameters.gain == pytest.approx(by_ep.hyperparameters.gain, rel=1e-9)
+
+
+def test_without_answers_there_is_an_error(scene):
+    study, cohort = scene
+    trials = eqx.tree_at(lambda t: t.mask, cohort.trials, jnp.zeros_like(cohort.trials.mask))
+    with pytest.raises(InputError, match="nobody gave an answer"):
+        fixed_and_optimised(study, Cohort(trials, np.zeros((3, 25, 3)), ("A", "B", "C")))
 
 
 def test_answers_near_an_optimum_are_counted(checked):

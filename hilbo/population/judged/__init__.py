@@ -1,4 +1,4 @@
-"""Response quality of participants, and prediction of participants who are left out.
+"""Response quality of participants, prediction of participants who are left out, and baselines.
 
-Baselines included.
+Also hyperparameters that maximise the evidence of participants who are left out, or of one model for all.
 """

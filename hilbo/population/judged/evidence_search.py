@@ -6,21 +6,21 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hilbo.hyperparameters.coordinates import Coordinates
 from hilbo.ordinal_gp import OrdinalGP
 
-__all__ = ["RUNAWAY", "Cost", "End", "Maximum", "descended"]
+__all__ = ["Cost", "End", "Maximum", "descended", "ran_away"]
 
 _STEPS = 200
 _NEAR = 1e-3  # nats that a step must gain for another
-RUNAWAY = 6.9
-"""Largest change of a coordinate that counts as a maximum: a factor of 1000."""
+_RUNAWAY = 6.9  # a factor of 1000: largest change of a hyperparameter that counts as a maximum
 
 
 class Maximum(NamedTuple):
     """Model with the hyperparameters that maximise an evidence with weak priors, and the outcome of the search.
 
     `log_evidence` is without the weak priors, `log_evidence_before` that of the model where the search started;
-    `runaway`: a hyperparameter changed by more than a factor 1000.
+    `steps`: evaluations of the evidence; `runaway`: a hyperparameter changed by more than a factor 1000.
     """
 
     gp: OrdinalGP
@@ -29,6 +29,13 @@ class Maximum(NamedTuple):
     steps: int
     converged: bool
     runaway: bool
+
+
+def ran_away(moved: Coordinates) -> bool:
+    """Whether a hyperparameter changed by more than a factor 1000, from the changes of all coordinates; the lowest
+    threshold, which is no logarithm, does not count.
+    """
+    return any(bool(np.any(np.abs(np.asarray(v)) > _RUNAWAY)) for name, v in moved.items() if name != "first")
 
 
 class Cost(NamedTuple):

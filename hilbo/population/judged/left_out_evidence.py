@@ -4,11 +4,14 @@ The criterion is the leave-one-participant-out marginal likelihood,
 
     sum_j log p(q_j | q_i of all i != j),
 
-in which the population map without participant j is the prior of that participant's function. The responses of j are
-predicted in turn (`newcomer.predicted_in_turn`), because a session chooses stimuli by earlier ones. The sum of the
-evidences of individual models is another criterion, and not one for a committee: with priors of mean 0 none of these
-models knows what participants have in common, and long length scales explain the common hill; the committee then
-multiplies the long-ranged posteriors of all participants, and its optimum moves to a corner of the search space.
+in which the population map without participant j is the prior of that participant's function: its mean and variance,
+with the correlations of the kernel. The joint probability of j's responses is the product of their predictions in
+turn, by assumed density filtering (`newcomer.in_turn`). For the hierarchical method the share is given.
+
+The sum of the evidences of individual models is another criterion, and not one for a committee: with priors of mean 0
+none of these models knows what participants have in common, and long length scales explain the common hill; the
+committee then multiplies the long-ranged posteriors of all participants, and its optimum moves to a corner of the
+search space.
 
 The weak priors are those of `hilbo.hyperparameters.maximum_evidence`. Searches start at three values of theta.
 Reference: Vehtari et al. (2016), JMLR 17(103):1, for leave-one-out densities of Gaussian latent variable models.
@@ -28,7 +31,7 @@ from hilbo.hyperparameters.coordinates import Coordinates, coordinates_of, log_p
 from hilbo.kernels import gram
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Trials, fit
-from hilbo.population.judged.evidence_search import RUNAWAY, Cost, Maximum, descended
+from hilbo.population.judged.evidence_search import Cost, Maximum, descended, ran_away
 from hilbo.population.newcomer import in_turn, with_variances
 from hilbo.population.pointwise import merged_without
 
@@ -89,14 +92,14 @@ def maximise_left_out(
     begin = np.asarray(ravel_pytree(initial)[0], float)
     before = float(cost(begin).log_evidence)
     ends = [descended(cost, np.asarray(ravel_pytree(start)[0], float)) for start in _starts(initial)]
-    end = min(ends, key=lambda each: each.cost if np.isfinite(each.cost) else np.inf)
+    end = min(ends, key=lambda each: each.cost)
     return Maximum(
         gp=model_at(restore(jnp.asarray(end.place, trials.x.dtype)), gp),
-        log_evidence=end.log_evidence,
+        log_evidence=end.log_evidence if np.isfinite(end.cost) else before,
         log_evidence_before=before,
         steps=end.steps,
         converged=end.converged,
-        runaway=bool(np.any(np.abs(end.place - begin) > RUNAWAY)),
+        runaway=ran_away(restore(jnp.asarray(end.place - begin, trials.x.dtype))),
     )
 
 
@@ -144,10 +147,12 @@ def _left_out_evidence(
     mean, variance = merged_without(rule, posteriors, x.reshape(-1, x.shape[2]), left_out, prior, share)
     apart = 0.0 if share is None else (1.0 - share) * prior
 
-    def predicted(x, q, mask, mean, variance):
+    @jax.checkpoint
+    def predicted(person):
+        x, q, mask, mean, variance = person
         covariance = with_variances(gram(gp.kernel, x, x), variance + apart)
         logs = in_turn(gp.likelihood, mean, covariance, q, mask).log_given
         return jnp.sum(jnp.where(mask, logs, 0.0))
 
-    given = jax.vmap(predicted)(x, q, mask, mean.reshape(q.shape), variance.reshape(q.shape))
+    given = jax.lax.map(predicted, (x, q, mask, mean.reshape(q.shape), variance.reshape(q.shape)))
     return jnp.sum(given), jnp.all(posteriors.certificate.converged)

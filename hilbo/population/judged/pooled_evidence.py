@@ -17,7 +17,7 @@ from hilbo.errors import InputError
 from hilbo.hyperparameters.coordinates import Coordinates, coordinates_of, log_prior, model_at
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Trials
-from hilbo.population.judged.evidence_search import RUNAWAY, Cost, Maximum, descended
+from hilbo.population.judged.evidence_search import Cost, Maximum, descended, ran_away
 from hilbo.population.shared.features import Pivots, pivots_for
 from hilbo.population.shared.low_rank import shared_evidence
 from hilbo.population.shared.people_model import PeopleModel
@@ -28,6 +28,7 @@ __all__ = ["maximise_pooled"]
 _ROUNDS = 8
 _LEFT = 1e-6  # part of the prior variance that the features may leave at a tested point
 _MOST = 640  # features: those of all points of 24 people with 25 trials
+_ROUGH = 0.05  # of the prior variance: what the features may leave at most
 _MOVED, _REACH = 0.35, 1.5  # of log theta: after which features are chosen again, and in one descent
 
 
@@ -63,11 +64,11 @@ def maximise_pooled(gp: OrdinalGP, trials: Trials, learn: tuple[str, ...]) -> Ma
         end = descended(partial(cost, pivots=pivots), place, _bounds(at(place)))
     return Maximum(
         gp=model_at(at(place), gp),
-        log_evidence=end.log_evidence,
+        log_evidence=end.log_evidence if np.isfinite(end.cost) else before,
         log_evidence_before=before,
         steps=steps,
-        converged=end.converged and settled,
-        runaway=bool(np.any(np.abs(place - begin) > RUNAWAY)),
+        converged=end.converged and settled and float(pivots.left) <= _ROUGH,
+        runaway=ran_away(at(place - begin)),
     )
 
 

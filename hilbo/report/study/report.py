@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hilbo.population.rules.registry import RULES
 from hilbo.report import validation
 from hilbo.report.page import Pictures, estimate_words, heads, number, percent, rendered
 from hilbo.report.participants import people_of
@@ -197,7 +198,8 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
     """
     from hilbo.report.figures.study import UNKNOWN, typical_person
 
-    readings = {"fixed": analysis.fixed, "optimised": analysis.optimised}
+    words = _hyperparameters(analysis.study.rule)
+    readings = dict(zip(words.values(), (analysis.fixed, analysis.optimised), strict=True))
     return {
         "name": material.name,
         "study": analysis.study,
@@ -213,7 +215,7 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "reference": None if material.reference is None else material.reference_name,
         "table_1": _with_units(analysis.study, tables["table_I"]),
         "alternatives": _alternatives(analysis.study, tables["alternatives"]),
-        "tolerance": _tolerances(tables["tolerance"]),
+        "tolerance": _tolerances(tables["tolerance"].replace({"hyperparameters": words})),
         "people": _shown(tables["people"].drop(columns=["categories", "left_out"]), digits=_DIGITS),
         "moved": content["optimised"]["nrmse"],
         "criterion": content["optimised"]["criterion"],
@@ -225,6 +227,12 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "halves": analysis.progress.splits,
         "validation": None if validated is None else validation.validation_section(validated),
     }
+
+
+def _hyperparameters(rule: str) -> dict[str, str]:
+    """Words of the page for the values of the column `hyperparameters` of tolerance.csv."""
+    learnt = {"fixed": "medians of the priors", "optimised": f"learnt by {rule}"}
+    return learnt if RULES[rule].learns else {"fixed": "fixed", "optimised": "optimised"}
 
 
 def _alternatives(study: Study, table: pd.DataFrame) -> dict[str, Any]:

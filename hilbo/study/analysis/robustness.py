@@ -28,11 +28,11 @@ from hilbo.population.rules.registry import RULES
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.analysis.bootstrap import can_resample, resampled_tops
-from hilbo.study.analysis.optimised import LEARNABLE, FixedAndOptimised, fixed_and_optimised
+from hilbo.study.analysis.optimised import LEARNABLE, FixedAndOptimised, differentiable, fixed_and_optimised
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort
-from hilbo.study.estimate.optimum import Optimum, map_optimum, predict_people
+from hilbo.study.estimate.optimum import Optimum, map_optimum, population_optimum, predict_people
 
 __all__ = ["LIMIT", "NEAR", "Place", "Resampled", "Robustness", "robustness"]
 
@@ -52,8 +52,9 @@ class Place(NamedTuple):
 
 
 class Resampled(NamedTuple):
-    """NRMSE in resamples of the participants, (draws,) each: of the optimum with fixed hyperparameters to that of all
-    participants, and of the optimum with optimised hyperparameters to that with fixed ones in the same resample.
+    """NRMSE in resamples of the participants, (draws,) each, of optima of maps that are aggregated point by point: with
+    fixed hyperparameters to that of all participants, and with optimised ones to that with fixed ones in the same
+    resample.
     """
 
     fixed: Float[np.ndarray, " draws"]
@@ -64,7 +65,8 @@ class Robustness(NamedTuple):
     """Optima with fixed and with optimised hyperparameters, and the distances between them.
 
     `fixed`: under the fixed map; `optimised`, `local` and `fixed_again` under the optimised one: its optimum, the local
-    one uphill of the fixed optimum, and the fixed optimum. `nrmse`, `local_nrmse`: of the optimised and of the local
+    one uphill of the fixed optimum (None for a method that learns, whose optimum is no maximum of the mean), and the
+    fixed optimum. `nrmse`, `local_nrmse`: of the optimised and of the local
     optimum to the fixed one; `individual_nrmse` (M,); `resampled`: None with fewer than two participants;
     `sensitivity`: d(fixed optimum, unit cube) / d(log theta, log noise, first threshold, log gaps), None for a method
     that learns them.
@@ -75,10 +77,10 @@ class Robustness(NamedTuple):
     optimised_aggregate: Aggregate
     fixed: Place
     optimised: Place
-    local: Place
+    local: Place | None
     fixed_again: Place
     nrmse: float
-    local_nrmse: float
+    local_nrmse: float | None
     individual_nrmse: Float[np.ndarray, " M"]
     resampled: Resampled | None
     sensitivity: dict[str, Float[Array, "..."]] | None
@@ -96,13 +98,13 @@ def robustness(study: Study, cohort: Cohort, seed: int = 0, *, learn: Sequence[s
     learns all. Raises `InputError` for another hyperparameter.
     """
     _check(learn)
+    learns = RULES[study.rule].learns
+    given = None if learns else aggregate_cohort(study, cohort, seed, alternatives=False)  # raises before the search
     both = fixed_and_optimised(study, cohort, tuple(learn))
-    fixed, optimised = (
-        aggregate_cohort(chosen, cohort, seed, alternatives=False) for chosen in (both.fixed, both.optimised)
-    )
+    fixed = aggregate_cohort(both.fixed, cohort, seed, alternatives=False) if given is None else given
+    optimised = aggregate_cohort(both.optimised, cohort, seed, alternatives=False)
     levels, best = study.gp.kernel.levels, fixed.optimum.x
-    there = partial(map_optimum, both.optimised, optimised.map)
-    local = there(best[None, :])
+    local = None if learns else map_optimum(both.optimised, optimised.map, best[None, :])
     place = partial(_place, cohort=cohort, levels=levels)
     return Robustness(
         hyperparameters=both,
@@ -110,20 +112,20 @@ def robustness(study: Study, cohort: Cohort, seed: int = 0, *, learn: Sequence[s
         optimised_aggregate=optimised,
         fixed=place(fixed.optimum),
         optimised=place(optimised.optimum),
-        local=place(local),
+        local=None if local is None else place(local),
         fixed_again=place(_at(both.optimised, optimised, best)),
         nrmse=float(nrmse(optimised.optimum.x, best, levels)),
-        local_nrmse=float(nrmse(local.x, best, levels)),
+        local_nrmse=None if local is None else float(nrmse(local.x, best, levels)),
         individual_nrmse=np.asarray(nrmse(optimised.individuals.x, fixed.individuals.x, levels)),
         resampled=_resampled((both.fixed, fixed), (both.optimised, optimised), seed),
-        sensitivity=None if RULES[study.rule].learns else _sensitivity_of(study, fixed, tuple(learn)),
+        sensitivity=None if learns else _sensitivity_of(study, fixed, tuple(learn), seed),
     )
 
 
 def _check(learn: Sequence[str]) -> None:
     """Raise InputError for hyperparameters that cannot be optimised here, and for none."""
     if "variance" in learn:
-        raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
+        raise InputError("robustness: the prior variance is kept, since it fixes the scale of the latent function.")
     unknown = [name for name in learn if name not in LEARNABLE]
     if unknown or not learn:
         asked = f'"{unknown[0]}"' if unknown else "nothing"
@@ -151,25 +153,33 @@ def _resampled(fixed: tuple[Study, Aggregate], optimised: tuple[Study, Aggregate
     if not can_resample(aggregate.posteriors):
         return None
     candidates, levels = search_points(study.space, seed)[:_POINTS], study.gp.kernel.levels
-    tops = [_tops(*each, candidates, seed) for each in (fixed, optimised)]
-    away = nrmse(tops[0], np.asarray(aggregate.optimum.x), levels)
-    return Resampled(np.asarray(away), np.asarray(nrmse(tops[1], tops[0], levels)))
+    (whole, tops), (_, others) = (_tops(*each, candidates, seed) for each in (fixed, optimised))
+    return Resampled(np.asarray(nrmse(tops, whole, levels)), np.asarray(nrmse(others, tops, levels)))
 
 
 def _tops(
     study: Study, aggregate: Aggregate, candidates: Float[Array, "m d"], seed: int
-) -> Float[np.ndarray, "draws d"]:
-    """Optimum of each resample of the participants, among the candidates and the optimum of all, (draws, d)."""
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "draws d"]]:
+    """Optimum (d,) of all participants, aggregated point by point, and those (draws, d) of resamples of them, among the
+    candidates and the optimum of the map.
+    """
     points = jnp.concatenate([aggregate.optimum.x[None, :], candidates])
     rule, share = point_rule(study.rule, aggregate.map.share)
+    whole = int(jnp.argmax(predict_people(aggregate.posteriors, points, rule, share)[0]))
     tops = resampled_tops(aggregate.posteriors, points, rule, share, study.gp.kernel.variance, seed)
-    return np.asarray(points)[tops]
+    return np.asarray(points)[whole], np.asarray(points)[tops]
 
 
-def _sensitivity_of(study: Study, aggregate: Aggregate, learn: tuple[str, ...]) -> dict[str, Float[Array, "..."]]:
-    """Derivatives of the fixed optimum by the hyperparameters `learn`, of participants aggregated point by point."""
-    rule, share = point_rule(study.rule, aggregate.map.share)
-    return _sensitivity(study, aggregate.cohort.trials, aggregate.optimum.x, learn, rule, share)
+def _sensitivity_of(
+    study: Study, aggregate: Aggregate, learn: tuple[str, ...], seed: int
+) -> dict[str, Float[Array, "..."]]:
+    """Derivatives by the hyperparameters `learn` of the optimum of participants who are aggregated point by point; it
+    is searched anew where the study's map is an exact one.
+    """
+    (rule, share), x = point_rule(study.rule, aggregate.map.share), aggregate.optimum.x
+    if aggregate.map.method == "exact":
+        x = population_optimum(study, aggregate.posteriors, search_points(study.space, seed), rule, share).x
+    return _sensitivity(study, aggregate.cohort.trials, x, learn, rule, share)
 
 
 @program
@@ -184,7 +194,7 @@ def _sensitivity(
     """Derivatives of the population optimum x by each hyperparameter in `learn`; see `Robustness.sensitivity`."""
 
     def refit(gp):
-        return jax.vmap(lambda t: fit(gp, t, inference=study.inference, throw=False))(trials)
+        return jax.vmap(lambda t: fit(gp, t, inference=differentiable(study.inference), throw=False))(trials)
 
     def height(w, posteriors: Posterior):
         return predict_people(posteriors, study.space.from_box(w)[None, :], rule, share)[0][0]

@@ -169,24 +169,17 @@ class Aggregate(eqx.Module):
         return to_device(middle_of(self.posteriors.gp.kernel.levels, np.asarray(self.individuals.x)))
 
 
-def fit_cohort(
-    study: Study, cohort: Cohort, gps: OrdinalGP | None = None, inference: Inference | None = None
-) -> Posterior:
-    """Posterior of each participant, stacked (M). `gps`: one stacked model per participant instead of the study's;
-    `inference`: instead of the study's. Fits that fail do not raise; see their certificates."""
-    return _fitted(study, cohort, gps, inference, _silent)
+def fit_cohort(study: Study, cohort: Cohort, inference: Inference | None = None) -> Posterior:
+    """Posterior of each participant, stacked (M). `inference`: instead of the study's. Fits that fail do not raise; see
+    their certificates."""
+    return _fitted(study, cohort, inference, _silent)
 
 
-def _fitted(
-    study: Study, cohort: Cohort, gps: OrdinalGP | None, inference: Inference | None, say: SayCount
-) -> Posterior:
-    """Posterior of each participant, stacked (M), fitted in batches. None for `gps` and `inference`: the study's. `say`
-    is called after each batch if there are several."""
+def _fitted(study: Study, cohort: Cohort, inference: Inference | None, say: SayCount) -> Posterior:
+    """Posterior of each participant, stacked (M), fitted in batches. None for `inference`: the study's. `say` is called
+    after each batch if there are several."""
     by = study.inference if inference is None else inference
-    if gps is None:
-        return _in_batches(lambda trials: _fit_cohort(study.gp, trials, by), cohort.trials, "participants fitted", say)
-    both = gps, cohort.trials
-    return _in_batches(lambda some: _fit_own(some[0], some[1], by), both, "participants fitted", say)
+    return _in_batches(lambda trials: _fit_cohort(study.gp, trials, by), cohort.trials, "participants fitted", say)
 
 
 # Programs take what they use: two studies that differ in their words share them.
@@ -198,12 +191,6 @@ def _fit_cohort(gp: OrdinalGP, trials: Trials, inference: Inference) -> Posterio
         return jax.vmap(lambda t: fit(gp, t, inference=inference, throw=False))(trials)
 
     return of_each_person(each, trials, gp)
-
-
-@program
-def _fit_own(gps: OrdinalGP, trials: Trials, inference: Inference) -> Posterior:
-    """Compiled fit of participants with one stacked model each."""
-    return of_each_person(jax.vmap(lambda both: fit(*both, inference=inference, throw=False)), (gps, trials))
 
 
 def _in_batches(function: Callable[[_People], _Result], people: _People, words: str, say: SayCount) -> _Result:
@@ -254,7 +241,7 @@ def aggregate_cohort(
         )
     study = resolved(study, cohort)
     candidates = search_points(study.space, seed)
-    posteriors = _fitted(study, cohort, None, None, say)
+    posteriors = _fitted(study, cohort, None, say)
     share = share_of(study.gp, cohort.trials, study.inference) if RULES[study.rule].learns_share else None
     map_ = _rule_map(study, cohort, study.rule, posteriors, share)
     optimum = map_optimum(study, map_, candidates)
