@@ -71,14 +71,14 @@ class Kills:
         words = Path(f"{session.out}.err").read_text(encoding="utf-8") if session.out.exists() else ""
         if "Traceback" in words:
             return f"THROUGH: traceback of the server\n{words}"
-        session.check(self.study)
+        session.check(self.study.file)
         return f"{victim}, {moment}"
 
     def close(self) -> None:
         """End the session that runs, and read its log a last time."""
         if self.session is not None:
             self.session.kill()
-            self.session.check(self.study)
+            self.session.check(self.study.file)
             self.session = None
 
     def _session(self, seed: int) -> Session:

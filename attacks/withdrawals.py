@@ -8,7 +8,6 @@ the results of every command on them. Case n takes person n out of a fresh copy.
 
 import contextlib
 import io
-import json
 import random
 import re
 import shutil
@@ -223,12 +222,13 @@ def _judged(folder: Path) -> None:
     from hilbo.session.log.log_files import log_name
     from hilbo.session.plan.plan import planned_header
     from hilbo.study.config import Study
+    from hilbo.study.file.plan_file import read_plan
 
     study = Study.load("study.toml")
     names = ",".join(f"J{number:02d}" for number in range(1, JUDGES + 1))
     given = ("--kind", "aggregate-best", "--from", "first-map/result.json", "--out", "plan-best.json")
     _run("plan", "study.toml", "--names", names, *given)
-    plan = json.loads(Path("plan-best.json").read_text())
+    plan = read_plan("plan-best.json")
     for name in names.split(","):
         header = planned_header(plan, study.file, name)
         assert log_name(header)

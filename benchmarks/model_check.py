@@ -22,7 +22,7 @@ from hilbo.population.judged.leave_one_out import clustered, leave_one_out_learn
 from hilbo.population.rules.registry import RECOMMENDED
 from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import simulate_study
-from hilbo.study.analysis.model_check import _compared, _differs
+from hilbo.study.analysis.model_check import _compared, _differs, _limits
 from hilbo.study.cohort import Cohort
 
 PEOPLE, TRIALS, FIRST, GROUPS = 24, 25, 50, 12
@@ -69,13 +69,14 @@ def one_study(name, seed):
         baseline[out] = -np.log(by_others[out, left.q[out]])
     content = {"given": float(np.mean(left.q == alone.shape[1] - 1))}
     content["new person"] = float(np.mean(chance_at(scene.chance, answers.x.reshape(q.size, -1))))
+    limits = _limits(alone.shape[1], PEOPLE)
     for way, predicted in (("alone", alone), ("in turn", left.probabilities)):
         cost = -np.log(predicted[np.arange(q.size), left.q])
         shares = [_compared((left.q == c).astype(float), predicted[:, c], left.person) for c in range(alone.shape[1])]
         gain, error = clustered(baseline - cost, left.person)
         content[way] = {
             "highest": float(predicted[:, -1].mean()),
-            "a share differs": any(map(_differs, shares)),
+            "a share differs": any(_differs(share, limits) for share in shares),
             "the quadratic is better": gain < 0.0,
             "beyond two errors": gain < -2.0 * error,
         }

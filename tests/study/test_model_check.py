@@ -6,13 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.stats import norm, t
 from studies import answered, plain_study
 
 from hilbo.errors import InputError
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.population.judged.baselines import constant, quadratic
-from hilbo.study.analysis.model_check import _compared, _differs, check_sentences, model_check
+from hilbo.study.analysis.model_check import _compared, _differs, _limits, check_sentences, model_check
 from hilbo.study.analysis.rule_comparison import compare
 from hilbo.study.cohort import Cohort
 from hilbo.study.estimate.aggregate import aggregate_cohort
@@ -58,16 +58,16 @@ def test_repeats_are_pairs_of_one_person(checked):
 
 def test_repeats_that_agree_too_often_are_spoken_of(checked):
     _, _, content = checked
-    told = content | {"repeats": {"pairs": 40, "given": 0.95, "predicted": 0.6, "error": 0.03}}
+    told = content | {"repeats": {"pairs": 40, "given": 0.95, "predicted": 0.6, "implied": 0.03, "clustered": 0.02}}
     (said,) = check_sentences(told)
     assert "the same answer in 95 % of 40 pairs, and 60 % were predicted" in said
 
 
 def test_what_fits_is_not_spoken_of(checked):
-    """Differences within two errors, or below 5 %."""
+    """Differences within the limit of either error, or below 5 %."""
     _, _, content = checked
-    near = {"given": 0.30, "predicted": 0.36, "error": 0.04}
-    small = {"given": 0.70, "predicted": 0.66, "error": 0.001}
+    near = {"given": 0.30, "predicted": 0.36, "implied": 0.04, "clustered": 0.001}
+    small = {"given": 0.70, "predicted": 0.66, "implied": 0.001, "clustered": 0.001}
     density = {name: {"cost": 1.0, "difference": -0.01, "error": 0.006} for name in ("constant", "quadratic")}
     fitting = {"shares": {"bad": near, "good": small}, "repeats": None, "negative_log_density": density}
     assert check_sentences(content | fitting) == []
@@ -89,11 +89,21 @@ def test_a_model_that_does_not_fit_is_spoken_of(checked):
     assert "the same shares everywhere would predict better" in said
 
 
+def test_the_limits_are_of_all_comparisons_and_of_few_people():
+    """Bonferroni; Student's t with one degree of freedom less than people, by SciPy's distributions."""
+    limits = _limits(6, 3)
+    assert limits.normal == pytest.approx(norm.isf(0.05 / 12)) and limits.student == pytest.approx(t.isf(0.05 / 12, 2))
+    row = {"given": 0.5, "predicted": 0.3, "implied": 0.07, "clustered": 0.01}
+    assert _differs(row, limits)
+    assert not _differs(row | {"clustered": 0.02}, limits) and not _differs(row | {"implied": 0.08}, limits)
+    assert _differs(row | {"clustered": 0.02}, _limits(6, 24))
+
+
 def test_few_answers_all_alike_are_no_misfit():
     """Five pairs that differ, each with probability 0.7, say little; by person their error would be 0.03."""
     row = _compared(np.zeros(5), np.array([0.2, 0.3, 0.3, 0.3, 0.4]), np.arange(5))
     assert row["error"] == pytest.approx(np.sqrt(0.16 + 3 * 0.21 + 0.24) / 5)
-    assert not _differs(row)
+    assert not _differs(row, _limits(5, 5))
     rng = np.random.default_rng(0)
     given = (rng.uniform(size=20) < 0.5).repeat(10).astype(float)  # of one person all the same
     assert _compared(given, np.full(200, 0.5), np.arange(200) // 10)["error"] > 0.1

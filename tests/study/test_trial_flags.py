@@ -179,3 +179,9 @@ def test_a_material_s_comparisons_are_counted_alone(tmp_path):
 def test_the_cell_of_some_flags():
     assert flag_words(["slewed", "saturated"]) == "saturated slewed" and flag_words([]) == ""
     assert flag_words(FLAGS) == " ".join(FLAGS)
+
+
+def test_a_table_of_warm_up_trials_alone_is_one_sentence(tmp_path):
+    """No row is fitted, and the columns of the device are those of no rows."""
+    with pytest.raises(NothingToFitError, match="all are warm-up"):
+        read(tmp_path, "participant,trial,response,u,phase,telemetry_samples\nA,1,close,0.4,warm-up,800\n")

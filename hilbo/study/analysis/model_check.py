@@ -5,12 +5,16 @@ others' responses and, response by response, from their own earlier ones: a sess
 without them a model that fits would seem not to. The hyperparameters are kept. Compared are the proportions of the
 responses (overall, per participant, and per third of a session), the test-retest agreement at repeated stimuli, and the
 predictive density with that of two baselines without a map, fitted to the others' responses
-(`hilbo.population.judged.baselines`). Errors are clustered by participant, and not below those that the predicted
-probabilities imply.
+(`hilbo.population.judged.baselines`). A misfit is named at a level of 5 % for all comparisons together (Bonferroni): a
+difference exceeds the normal quantile of the error that the predicted probabilities imply, and the t quantile, with one
+degree of freedom less than participants, of the error that is clustered by participant.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtri, stdtrit
 
 from hilbo.population.judged.baselines import constant, quadratic
 from hilbo.population.judged.leave_one_out import LeftOut, clustered, leave_one_out, leave_one_out_learnt
@@ -22,7 +26,7 @@ from hilbo.study.formats.json_file import Content
 __all__ = ["check_sentences", "model_check"]
 
 _FOLDS, _DEAR_FOLDS = 24, 6  # at most; the latter where each is a fit of all answers
-_ERRORS, _WORTH = 2.0, 0.05  # a difference that is said: so many errors, and of shares so much
+_FALSE, _WORTH = 0.05, 0.05  # probability of naming a misfit where there is none; smallest difference of shares
 _BASELINES = {"constant": "the same shares everywhere", "quadratic": "a quadratic ordinal probit of all answers"}
 _GROUPS = 12  # of people, in which the baselines leave them out
 
@@ -67,25 +71,39 @@ def check_sentences(content: Content | None) -> list[str]:
     None)."""
     if content is None:
         return []
+    repeats = content["repeats"]
+    limits = _limits(len(content["shares"]) + (repeats is not None) + len(_BASELINES), len(content["by_person"]))
     wrong = [
         f'{_percent(row["given"])} of their answers were "{label}", and {_percent(row["predicted"])} were predicted'
         for label, row in content["shares"].items()
-        if _differs(row)
+        if _differs(row, limits)
     ]
-    repeats = content["repeats"]
-    if repeats is not None and _differs(repeats):
+    if repeats is not None and _differs(repeats, limits):
         wrong.append(
             f"repeated renderings got the same answer in {_percent(repeats['given'])} of {repeats['pairs']} pairs, and"
             f" {_percent(repeats['predicted'])} were predicted"
         )
     for name, words in _BASELINES.items():
         row = content["negative_log_density"][name]
-        if row["difference"] < -_ERRORS * row["error"]:
+        if row["difference"] < -limits.student * row["error"]:
             wrong.append(f"{words} would predict better ({-row['difference']:.3f} ± {row['error']:.3f} nats an answer)")
     if not wrong:
         return []
     by = "the study's hyperparameters" if content["hyperparameters"] == "as stated" else "the learnt hyperparameters"
     return [f"With {by} the model does not fit people who were left out and predicted: {'; '.join(wrong)}."]
+
+
+class _Limits(NamedTuple):
+    """Quantiles of simultaneous comparisons, in errors: of a normal distribution, and of Student's t."""
+
+    normal: float
+    student: float
+
+
+def _limits(comparisons: int, people: int) -> _Limits:
+    """Limits of so many two-sided comparisons at a common level of 5 %; `people`: number of clusters."""
+    tail = _FALSE / (2 * comparisons)
+    return _Limits(float(-ndtri(tail)), float(-stdtrit(people - 1, tail)))
 
 
 def _percent(share: float) -> str:
@@ -131,18 +149,19 @@ def _shares(study: Study, left: LeftOut, chosen: Float[np.ndarray, "n C"], rows:
 def _compared(
     given: Float[np.ndarray, " n"], predicted: Float[np.ndarray, " n"], person: np.ndarray
 ) -> dict[str, float]:
-    """Mean of outcomes (0 or 1) and of their probabilities, as "given" and "predicted", and "error", the standard error
-    of the difference: clustered by participant, or as the probabilities imply if that is larger, because few equal
-    responses make the former too small."""
+    """Mean of outcomes (0 or 1) and of their probabilities, as "given" and "predicted", with the standard errors of the
+    difference: "clustered" by participant, "implied" by the probabilities, and "error", the larger of the two, because
+    few equal responses make the former too small."""
     _, error = clustered(given - predicted, person)
     implied = float(np.sqrt(np.sum(predicted * (1.0 - predicted)))) / len(given)
-    return {"given": float(given.mean()), "predicted": float(predicted.mean()), "error": float(np.fmax(error, implied))}
+    means = {"given": float(given.mean()), "predicted": float(predicted.mean())}
+    return means | {"error": float(np.fmax(error, implied)), "clustered": float(error), "implied": implied}
 
 
-def _differs(row: Content) -> bool:
-    """Whether observed and predicted differ by more than 0.05 and by more than two errors."""
+def _differs(row: Content, limits: _Limits) -> bool:
+    """Whether observed and predicted differ by more than 0.05 and by more than both errors allow."""
     gap = abs(row["given"] - row["predicted"])
-    return gap > _WORTH and gap > _ERRORS * row["error"]
+    return gap > max(_WORTH, limits.normal * row["implied"], limits.student * row["clustered"])
 
 
 def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> Content | None:

@@ -28,9 +28,10 @@ def counted_flags(table: pd.DataFrame, exclude: Collection[str]) -> FlagCounts:
     if COLUMN not in table and COLUMN_OF_SAMPLES not in table:
         return FlagCounts()
     carried = _carried(table)
-    recorded = carried.map(bool)
+    recorded = carried.map(bool).astype(bool)  # of no rows `map` gives the type of the cells
     if COLUMN_OF_SAMPLES in table:
-        recorded |= table[COLUMN_OF_SAMPLES].map(lambda cell: str(cell).strip().lower() not in _NONE_RECORDED)
+        sampled = table[COLUMN_OF_SAMPLES].map(lambda cell: str(cell).strip().lower() not in _NONE_RECORDED)
+        recorded |= sampled.astype(bool)
     rows_of = Counter(name for names in carried for name in names)
     excluded = Counter(table.loc[flagged(table, exclude), "participant"].map(str))
     return FlagCounts(int(recorded.sum()), {name: rows_of[name] for name in FLAGS if rows_of[name]}, excluded)
