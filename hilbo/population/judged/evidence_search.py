@@ -50,8 +50,8 @@ class Cost(NamedTuple):
 
 
 class End(NamedTuple):
-    """End of one search: the lowest cost that it met, its coordinates and log evidence, evaluations, and whether it
-    converged with all fits.
+    """End of one search: the lowest cost that it met, its coordinates and log evidence, evaluations, whether it
+    converged with all fits, and the log evidence where it started (`first`).
     """
 
     cost: float
@@ -59,6 +59,7 @@ class End(NamedTuple):
     log_evidence: float
     steps: int
     converged: bool
+    first: float
 
 
 def descended(
@@ -73,23 +74,27 @@ def descended(
     """
     from scipy.optimize import minimize  # a fifth of a second, which commands that learn nothing need not wait
 
-    best = End(np.inf, begin, -np.inf, 0, False)
+    best = End(np.inf, begin, -np.inf, 0, False, -np.inf)
 
     def evaluated(place: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " p"]]:
         nonlocal best
         here = cost(place)
         value, slope, steps = float(here.value), np.asarray(here.gradient, float), best.steps + 1
+        best = best._replace(steps=steps, first=float(here.log_evidence) if steps == 1 else best.first)
         if not (np.isfinite(value) and np.all(np.isfinite(slope))):
             raise _NotFiniteError
         if value < best.cost:
-            best = End(value, place.copy(), float(here.log_evidence), steps, bool(here.converged))
-        best = best._replace(steps=steps)
+            best = End(value, place.copy(), float(here.log_evidence), steps, bool(here.converged), best.first)
         return value, slope
 
     try:
-        near = _NEAR / max(1.0, abs(evaluated(begin)[0]))  # SciPy's is a part of the cost
-        options = {"maxiter": _STEPS, "ftol": near, "gtol": 1e-3}
-        end = minimize(evaluated, begin, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        start = evaluated(begin)
+        options = {"maxiter": _STEPS, "ftol": _NEAR / max(1.0, abs(start[0])), "gtol": 1e-3}  # a part of the cost
+
+        def once(place: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " p"]]:
+            return start if np.array_equal(place, begin) else evaluated(place)
+
+        end = minimize(once, begin, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         ended = bool(end.success)
     except _NotFiniteError:  # L-BFGS-B would take an infinite cost for its end
         ended = False

@@ -90,9 +90,8 @@ def maximise_left_out(
         return _cost(jnp.asarray(flat, trials.x.dtype), gp, trials, rows, share, learn, rule, inference)
 
     begin = np.asarray(ravel_pytree(initial)[0], float)
-    before = float(cost(begin).log_evidence)
     ends = [descended(cost, np.asarray(ravel_pytree(start)[0], float)) for start in _starts(initial)]
-    end = min(ends, key=lambda each: each.cost)
+    end, before = min(ends, key=lambda each: each.cost), ends[0].first
     return Maximum(
         gp=model_at(restore(jnp.asarray(end.place, trials.x.dtype)), gp),
         log_evidence=end.log_evidence if np.isfinite(end.cost) else before,

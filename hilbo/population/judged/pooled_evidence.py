@@ -53,8 +53,8 @@ def maximise_pooled(gp: OrdinalGP, trials: Trials, learn: tuple[str, ...]) -> Ma
 
     begin = place = np.asarray(flat, float)
     pivots, steps, settled = _pivots(gp, answers), 0, False
-    before = float(cost(begin, pivots).log_evidence)
     end = descended(partial(cost, pivots=pivots), begin, _bounds(at(begin)))
+    before = end.first
     for _ in range(_ROUNDS):
         moved, place, steps = end.place - place, end.place, steps + end.steps
         settled = bool(np.all(np.abs(np.asarray(at(moved).get("theta", 0.0))) <= _MOVED))
