@@ -8,7 +8,9 @@ from studies import answered, plain_study
 
 from hilbo.report.results import write_results
 from hilbo.report.study.report import write_study
+from hilbo.study.analysis import analysis
 from hilbo.study.analysis.cohort_results import analyse_cohort
+from hilbo.study.analysis.optimised import fixed_and_optimised
 from hilbo.study.folder import Material, StudyFolder
 
 pytestmark = [pytest.mark.deep, pytest.mark.empties_caches]
@@ -25,14 +27,18 @@ def test_aggregate_fits_each_model_to_each_data_once(tmp_path):
     assert sum(key.startswith(f"{TRIALS} answers, ep") for key in fits) == PEOPLE
 
 
-def test_report_fits_each_model_to_each_data_once(tmp_path):
-    """With every rule compared, each person left out in turn. The search for hyperparameters fits those where it begins
-    and ends again, to differentiate them."""
+def test_report_fits_each_model_to_each_data_once(tmp_path, monkeypatch):
+    """With every rule compared, each person left out in turn; and the search for hyperparameters, which differentiates
+    its fits, by itself."""
     study = plain_study(2)
-    material = Material("", study, answered(study, PEOPLE, TRIALS), None, None, "")
+    cohort = answered(study, PEOPLE, TRIALS)
+    with count_fits() as searched:
+        both = fixed_and_optimised(study, cohort)
+    assert searched and set(searched.values()) == {1}
+    monkeypatch.setattr(analysis, "fixed_and_optimised", lambda study, cohort: both)
+    material = Material("", study, cohort, None, None, "")
     with count_fits() as fits:
         write_study(StudyFolder(study, [material], None, ()), tmp_path)
-    again = {key: count for key, count in fits.items() if count > 1}
-    assert len(again) == 2 * PEOPLE and set(again.values()) == {2}
+    assert {key: count for key, count in fits.items() if count > 1} == {}
     # the hierarchical fit without each person; the pooled one is made from counts of answers, which are not seen here
     assert sum(key.startswith(f"{(PEOPLE - 1) * TRIALS} answers, laplace") for key in fits) == PEOPLE

@@ -78,7 +78,7 @@ def test_exact_inference_has_no_derivatives_and_is_checked_by_ep(scene):
 def test_without_answers_there_is_an_error(scene):
     study, cohort = scene
     trials = eqx.tree_at(lambda t: t.mask, cohort.trials, jnp.zeros_like(cohort.trials.mask))
-    with pytest.raises(InputError, match="nobody gave an answer"):
+    with pytest.raises(InputError, match="there are no responses"):
         fixed_and_optimised(study, Cohort(trials, np.zeros((3, 25, 3)), ("A", "B", "C")))
 
 

@@ -41,7 +41,7 @@ def maximise_pooled(gp: OrdinalGP, trials: Trials, learn: tuple[str, ...]) -> Ma
     Raises `InputError` without responses. A search that fails does not raise: read `converged`.
     """
     if not np.asarray(trials.mask).any():
-        raise InputError("maximise_pooled: nobody gave an answer; at least one person's answers are needed.")
+        raise InputError("maximise_pooled: there are no responses; at least one is needed.")
     answers = tallied(trials, gp.likelihood.categories)
     flat, restore = ravel_pytree(coordinates_of(gp, learn))
 

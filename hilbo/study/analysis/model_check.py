@@ -101,7 +101,7 @@ class _Limits(NamedTuple):
 
 
 def _limits(comparisons: int, people: int) -> _Limits:
-    """Limits of so many two-sided comparisons at a common level of 5 %; `people`: number of clusters."""
+    """Limits for this number of two-sided comparisons at a common level of 5 %; `people`: number of clusters."""
     tail = _FALSE / (2 * comparisons)
     return _Limits(float(-ndtri(tail)), float(-stdtrit(people - 1, tail)))
 

@@ -63,7 +63,7 @@ def fixed_and_optimised(study: Study, cohort: Cohort, learn: tuple[str, ...] = L
     """
     rule, trials = RULES[study.rule], cohort.trials
     if not np.asarray(trials.mask).any():
-        raise InputError("hyperparameters: nobody gave an answer; at least one person's answers are needed.")
+        raise InputError("hyperparameters: there are no responses; at least one is needed.")
     if rule.learns:
         return _learnt(study, cohort)
     if np.sum(cohort.counts() > 0) < 2:

@@ -174,7 +174,7 @@ def _sensitivity_of(
     study: Study, aggregate: Aggregate, learn: tuple[str, ...], seed: int
 ) -> dict[str, Float[Array, "..."]]:
     """Derivatives by the hyperparameters `learn` of the optimum of participants who are aggregated point by point; it
-    is searched anew where the study's map is an exact one.
+    is searched again if the study's map is exact.
     """
     (rule, share), x = point_rule(study.rule, aggregate.map.share), aggregate.optimum.x
     if aggregate.map.method == "exact":
