@@ -51,25 +51,30 @@ def maximise_pooled(gp: OrdinalGP, trials: Trials, learn: tuple[str, ...]) -> Ma
     def cost(place: Float[np.ndarray, " p"], pivots: Pivots) -> Cost:
         return _cost(jnp.asarray(place, flat.dtype), gp, answers, pivots, learn)
 
-    begin = place = np.asarray(flat, float)
-    pivots, steps, settled = _pivots(gp, answers), 0, False
+    begin = np.asarray(flat, float)
+    pivots = _pivots(gp, answers)
     end = descended(partial(cost, pivots=pivots), begin, _bounds(at(begin)))
-    before = end.first
+    before, place, steps, settled = end.first, begin, end.steps, False
     for _ in range(_ROUNDS):
-        moved, place, steps = end.place - place, end.place, steps + end.steps
-        settled = bool(np.all(np.abs(np.asarray(at(moved).get("theta", 0.0))) <= _MOVED))
+        settled = _settled(at(end.place - place))
         if settled:
             break
-        pivots = _pivots(model_at(at(place), gp), answers)
+        place, pivots = end.place, _pivots(model_at(at(end.place), gp), answers)
         end = descended(partial(cost, pivots=pivots), place, _bounds(at(place)))
+        steps += end.steps
     return Maximum(
-        gp=model_at(at(place), gp),
+        gp=model_at(at(end.place), gp),
         log_evidence=end.log_evidence if np.isfinite(end.cost) else before,
         log_evidence_before=before,
         steps=steps,
         converged=end.converged and settled and float(pivots.left) <= _ROUGH,
-        runaway=ran_away(at(place - begin)),
+        runaway=ran_away(at(end.place - begin)),
     )
+
+
+def _settled(moved: Coordinates) -> bool:
+    """Whether the length scales changed so little that the features still serve."""
+    return bool(np.all(np.abs(np.asarray(moved.get("theta", 0.0))) <= _MOVED))
 
 
 def _pivots(gp: OrdinalGP, answers: Tallies) -> Pivots:
