@@ -179,7 +179,7 @@ def _aggregates(both: FixedAndOptimised, own: Aggregate, seed: int) -> tuple[Agg
     """Aggregates with fixed and with optimised hyperparameters. `own`: the study's, which is one of them."""
     studies = both.fixed, both.optimised
     learns = RULES[both.fixed.rule].learns
-    other = aggregate_cohort(studies[not learns], own.cohort, seed, alternatives=False)
+    other = aggregate_cohort(studies[not learns], own.cohort, seed, alternatives=False, individuals=False)
     return (other, own) if learns else (own, other)
 
 
