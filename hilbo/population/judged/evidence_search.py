@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hilbo.hyperparameters.coordinates import Coordinates
+from hilbo.numerics.descent import Point, descended
 from hilbo.ordinal_gp import OrdinalGP
 
-__all__ = ["Cost", "End", "Maximum", "descended", "ran_away"]
+__all__ = ["Cost", "End", "Maximum", "ran_away", "searched"]
 
 _STEPS = 200
 _NEAR = 1e-3  # nats that a step must gain for another
@@ -20,7 +21,7 @@ class Maximum(NamedTuple):
     """Model with the hyperparameters that maximise an evidence with weak priors, and the outcome of the search.
 
     `log_evidence` is without the weak priors, `log_evidence_before` that of the model where the search started;
-    `steps`: evaluations of the evidence; `runaway`: a hyperparameter changed by more than a factor 1000.
+    `steps`: of L-BFGS-B; `runaway`: a hyperparameter changed by more than a factor 1000.
     """
 
     gp: OrdinalGP
@@ -50,56 +51,32 @@ class Cost(NamedTuple):
 
 
 class End(NamedTuple):
-    """End of one search: the lowest cost that it met, its coordinates and log evidence, evaluations, whether it
-    converged with all fits, and the log evidence where it started (`first`).
+    """End of one search: the lowest cost that it met, its coordinates and log evidence, whether it converged with all
+    fits, number of steps, and the log evidence where it started (`first`).
     """
 
     cost: float
     place: Float[np.ndarray, " p"]
     log_evidence: float
-    steps: int
     converged: bool
-    first: float
+    steps: int = 0
+    first: float = -np.inf
 
 
-def descended(
+def searched(
     cost: Callable[[Float[np.ndarray, " p"]], Cost],
     begin: Float[np.ndarray, " p"],
     bounds: list[tuple[float, float]] | None = None,
 ) -> End:
-    """Minimise a cost by L-BFGS-B from `begin` (p,), within `bounds`.
+    """Minimise a cost from `begin` (p,), within `bounds`. It has not converged if a cost was not finite."""
 
-    A cost or gradient that is not finite ends the search, which then has not converged; the cost is infinite if it was
-    so at the start.
-    """
-    from scipy.optimize import minimize  # a fifth of a second, which commands that learn nothing need not wait
-
-    best = End(np.inf, begin, -np.inf, 0, False, -np.inf)
-
-    def evaluated(place: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " p"]]:
-        nonlocal best
+    def point(place: Float[np.ndarray, " p"]) -> Point[End]:
         here = cost(place)
-        value, slope, steps = float(here.value), np.asarray(here.gradient, float), best.steps + 1
-        best = best._replace(steps=steps, first=float(here.log_evidence) if steps == 1 else best.first)
-        if not (np.isfinite(value) and np.all(np.isfinite(slope))):
-            raise _NotFiniteError
-        if value < best.cost:
-            best = End(value, place.copy(), float(here.log_evidence), steps, bool(here.converged), best.first)
-        return value, slope
+        value = float(here.value)
+        end = End(value, place.copy(), float(here.log_evidence), bool(here.converged))
+        return Point(value, np.asarray(here.gradient, float), end)
 
-    try:
-        start = evaluated(begin)
-        options = {"maxiter": _STEPS, "ftol": _NEAR / max(1.0, abs(start[0])), "gtol": 1e-3}  # a part of the cost
-
-        def once(place: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " p"]]:
-            return start if np.array_equal(place, begin) else evaluated(place)
-
-        end = minimize(once, begin, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-        ended = bool(end.success)
-    except _NotFiniteError:  # L-BFGS-B would take an infinite cost for its end
-        ended = False
-    return best._replace(converged=best.converged and ended)
-
-
-class _NotFiniteError(Exception):
-    """Raised within a descent where the cost, or its gradient, is not finite."""
+    start = point(begin)
+    end = descended(point, begin, start, _NEAR, bounds, most=_STEPS)
+    lowest = end.lowest
+    return lowest._replace(converged=lowest.converged and end.ended, steps=end.steps, first=start.aux.log_evidence)

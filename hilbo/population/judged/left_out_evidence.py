@@ -31,7 +31,7 @@ from hilbo.hyperparameters.coordinates import Coordinates, coordinates_of, log_p
 from hilbo.kernels import gram
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Trials, fit
-from hilbo.population.judged.evidence_search import Cost, Maximum, descended, ran_away
+from hilbo.population.judged.evidence_search import Cost, Maximum, ran_away, searched
 from hilbo.population.newcomer import in_turn, with_variances
 from hilbo.population.pointwise import merged_without
 
@@ -90,8 +90,8 @@ def maximise_left_out(
         return _cost(jnp.asarray(flat, trials.x.dtype), gp, trials, rows, share, learn, rule, inference)
 
     begin = np.asarray(ravel_pytree(initial)[0], float)
-    ends = [descended(cost, np.asarray(ravel_pytree(start)[0], float)) for start in _starts(initial)]
-    end, before = min(ends, key=lambda each: each.cost), ends[0].first
+    ends = [searched(cost, np.asarray(ravel_pytree(start)[0], float)) for start in _starts(initial)]
+    end, before = min(ends, key=lambda each: each.cost if np.isfinite(each.cost) else np.inf), ends[0].first
     return Maximum(
         gp=model_at(restore(jnp.asarray(end.place, trials.x.dtype)), gp),
         log_evidence=end.log_evidence if np.isfinite(end.cost) else before,

@@ -17,7 +17,7 @@ from hilbo.errors import InputError
 from hilbo.hyperparameters.coordinates import Coordinates, coordinates_of, log_prior, model_at
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Trials
-from hilbo.population.judged.evidence_search import Cost, Maximum, descended, ran_away
+from hilbo.population.judged.evidence_search import Cost, Maximum, ran_away, searched
 from hilbo.population.shared.features import Pivots, pivots_for
 from hilbo.population.shared.low_rank import shared_evidence
 from hilbo.population.shared.people_model import PeopleModel
@@ -53,14 +53,14 @@ def maximise_pooled(gp: OrdinalGP, trials: Trials, learn: tuple[str, ...]) -> Ma
 
     begin = np.asarray(flat, float)
     pivots = _pivots(gp, answers)
-    end = descended(partial(cost, pivots=pivots), begin, _bounds(at(begin)))
+    end = searched(partial(cost, pivots=pivots), begin, _bounds(at(begin)))
     before, place, steps, settled = end.first, begin, end.steps, False
     for _ in range(_ROUNDS):
         settled = _settled(at(end.place - place))
         if settled:
             break
         place, pivots = end.place, _pivots(model_at(at(end.place), gp), answers)
-        end = descended(partial(cost, pivots=pivots), place, _bounds(at(place)))
+        end = searched(partial(cost, pivots=pivots), place, _bounds(at(place)))
         steps += end.steps
     return Maximum(
         gp=model_at(at(end.place), gp),

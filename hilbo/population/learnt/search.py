@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from hilbo.numerics.descent import Point, descended
 from hilbo.population.learnt.posterior import KERNELS, LEFT, Coordinates, Cost, Problem, Stated, cost_at, model_at
 from hilbo.population.rules.recipes import Recipe
 from hilbo.population.shared.features import pivots_for
@@ -74,48 +75,27 @@ def _descended(search: Search, problem: Problem, free: Set[str]) -> Search:
     Returns the lowest cost met, with the steps added; `ended` is False if a cost was not usable, or L-BFGS did not
     converge.
     """
-    from scipy.optimize import minimize  # a fifth of a second, which commands that learn nothing need not wait
-
     held = {name: value for name, value in search.coordinates.items() if name not in free}
     begin = {name: value for name, value in search.coordinates.items() if name in free}
     units = ravel_pytree({name: jnp.full_like(value, _UNITS[name]) for name, value in begin.items()})[0]
     flat, restore = ravel_pytree(begin)
-    latest, lowest = search, search
+    weights = search.cost.weights
 
-    def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
-        nonlocal latest, lowest
-        here = search
-        if np.any(z):
-            coordinates = held | restore(flat + units * jnp.asarray(z, flat.dtype))
-            here = Search(coordinates, cost_at(coordinates, latest.cost.weights, problem), 0, False)
-        if not bool(here.cost.usable):
-            raise _UnusableError
-        latest = here
-        lowest = min(lowest, here, key=lambda each: float(each.cost.value))
+    def point(here: Search) -> Point[Search]:
         slope = ravel_pytree({name: here.cost.gradient[name] for name in free})[0]
-        return float(here.cost.value), np.asarray(units * slope, float)
+        value = float(here.cost.value) if bool(here.cost.usable) else np.inf
+        return Point(value, np.asarray(units * slope, float), here)
 
-    steps = 0
+    def cost(z: np.ndarray) -> Point[Search]:
+        nonlocal weights
+        coordinates = held | restore(flat + units * jnp.asarray(z, flat.dtype))
+        here = Search(coordinates, cost_at(coordinates, weights, problem), 0, False)
+        weights = here.cost.weights
+        return point(here)
 
-    def count(_: object) -> None:
-        nonlocal steps
-        steps += 1
-
-    near = _NEAR / max(1.0, abs(float(search.cost.value)))  # SciPy's is a part of the cost
-    options = {"maxiter": _STEPS, "ftol": near, "gtol": 1e-3, "maxcor": _REMEMBERED}
-    bounds = _bounds(begin, problem)
-    try:
-        result = minimize(
-            cost, np.zeros(flat.size), jac=True, method="L-BFGS-B", bounds=bounds, callback=count, options=options
-        )
-        ended = bool(result.success)
-    except _UnusableError:  # L-BFGS-B does not turn back where the cost is infinite: it would say that it has ended
-        ended = False
-    return lowest._replace(steps=search.steps + steps, ended=ended)
-
-
-class _UnusableError(Exception):
-    """Raised within a descent where no mode was found, or a gradient is not finite."""
+    options = {"most": _STEPS, "remembered": _REMEMBERED}
+    end = descended(cost, np.zeros(flat.size), point(search), _NEAR, _bounds(begin, problem), **options)
+    return end.lowest._replace(steps=search.steps + end.steps, ended=end.ended)
 
 
 def _bounds(begin: Coordinates, problem: Problem) -> list[tuple[float, float]]:
