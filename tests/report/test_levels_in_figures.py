@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from studies import PLAIN
 from surfaces import SURFACES, TEXTURES, surfaces
 
+from hilbo.ordinal_gp import Trials, fit
 from hilbo.report.figures import on_axes, regions
 from hilbo.report.figures.population import coverage_figure
 from hilbo.report.figures.progress import progress_figure
@@ -40,9 +41,9 @@ class Asked:
 
 
 def curve_of_a_map(asked, monkeypatch):
-    monkeypatch.setattr(on_axes, "_maximum", lambda study, model: np.zeros(1))
+    monkeypatch.setattr(on_axes, "_mean_and_variance", lambda model, x: asked.predict(x))
     axes = Figure().subplots()
-    on_axes.draw_map(ONE, asked, ax=axes)
+    on_axes.draw_map(ONE, fit(ONE.gp, Trials.from_arrays(np.array([[0.5]]), np.array([2]))), ax=axes)
     return axes
 
 
@@ -91,9 +92,10 @@ def test_distances_to_the_truth_are_those_of_the_tables(monkeypatch):
     counts, none = np.arange(1, 4), np.zeros((3, 0))
     progress = Progress(counts, optima, optima[:, None], np.array([3]), none, np.ones((3, 1)), {}, (0, 3, 0))
     monkeypatch.setattr("hilbo.report.figures.progress._top_answers", lambda *_: None)
+    monkeypatch.setattr(CohortResults, "cohort", None)
     following = Future()
     following.set_result(progress)
-    done = CohortResults(study, SimpleNamespace(cohort=None), following, 0, None, None)
+    done = CohortResults(study, None, following, 0, None, None)
     left = progress_figure(study, done, truth).axes[0]
     expected = 100 * misses(study, optima, truth)[0]
     for line in left.lines[:2]:  # of individuals, of which there is one, and of the population

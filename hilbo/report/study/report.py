@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hilbo.population.rules.registry import RULES
 from hilbo.report import validation
 from hilbo.report.page import Pictures, estimate_words, heads, number, percent, rendered
 from hilbo.report.participants import people_of
@@ -198,8 +197,9 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
     """
     from hilbo.report.figures.study import UNKNOWN, typical_person
 
-    words = _hyperparameters(analysis.study.rule)
-    readings = dict(zip(words.values(), (analysis.fixed, analysis.optimised), strict=True))
+    labels = analysis.hyperparameters.labels
+    readings = zip(labels, (analysis.fixed, analysis.optimised), strict=True)
+    words = dict(zip(("fixed", "optimised"), labels, strict=True))
     return {
         "name": material.name,
         "study": analysis.study,
@@ -220,19 +220,11 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "moved": content["optimised"]["nrmse"],
         "criterion": content["optimised"]["criterion"],
         "model_check": content["model_check"],
-        "without": [
-            name for name, reading in readings.items() if all(i is None for i, _ in reading.tolerances.values())
-        ],
+        "without": [name for name, reading in readings if all(i is None for i, _ in reading.tolerances.values())],
         "comparison": content["comparison"] and comparison_section(analysis.study, content["comparison"]),
         "halves": analysis.progress.splits,
         "validation": None if validated is None else validation.validation_section(validated),
     }
-
-
-def _hyperparameters(rule: str) -> dict[str, str]:
-    """Words of the page for the values of the column `hyperparameters` of tolerance.csv."""
-    learnt = {"fixed": "medians of the priors", "optimised": f"learnt by {rule}"}
-    return learnt if RULES[rule].learns else {"fixed": "fixed", "optimised": "optimised"}
 
 
 def _alternatives(study: Study, table: pd.DataFrame) -> dict[str, Any]:

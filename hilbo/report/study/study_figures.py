@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from hilbo.population.rules.registry import RULES
 from hilbo.study.analysis.analysis import Analysis
 from hilbo.study.analysis.effects import effects_of
 from hilbo.study.folder import Material
@@ -32,10 +31,10 @@ def study_figures(
     chosen, cohort, aggregate, progress = analysis.study, analysis.cohort, analysis.aggregate, analysis.progress
     best, prior = np.asarray(aggregate.optimum.x), aggregate.map.map_prior
     references = {} if material.reference is None else {material.reference_name: material.reference}
-    learns = RULES[chosen.rule].learns
-    fixed = "medians of the priors" if learns else "fixed hyperparameters"
-    optimised = f"learnt by {chosen.rule}" if learns else "optimised hyperparameters"
-    regions = {fixed: analysis.fixed, optimised: analysis.optimised}
+    regions = {
+        f"hyperparameters: {label}": reading
+        for label, reading in zip(analysis.hyperparameters.labels, (analysis.fixed, analysis.optimised), strict=True)
+    }
     map_, hatched = study.sets_on_map(chosen, aggregate.surface, analysis.sets, best, cohort, prior)
     figures = {
         "progression": study.posterior_progress(chosen, cohort, progress, study.typical_person(analysis)),

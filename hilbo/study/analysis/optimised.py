@@ -54,6 +54,12 @@ class FixedAndOptimised(NamedTuple):
     runaway: bool
     limits: tuple[str, ...] = ()
 
+    @property
+    def labels(self) -> tuple[str, str]:
+        """Words for the fixed and the optimised hyperparameters, in titles of figures and tables."""
+        rule = RULES[self.fixed.rule]
+        return ("medians of the priors", f"learnt by {rule.name}") if rule.learns else ("fixed", "optimised")
+
 
 def fixed_and_optimised(study: Study, cohort: Cohort, learn: tuple[str, ...] = LEARNABLE) -> FixedAndOptimised:
     """Optimise the hyperparameters `learn` for a cohort, by the criterion of the study's method.
