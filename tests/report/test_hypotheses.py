@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from studies import plain
 
-from hilbo.report.study.hypotheses import _individuals, _largest, _validation
+from hilbo.report.study.hypotheses import _convergence, _individuals, _largest, _validation
 
 
 @pytest.mark.parametrize(
@@ -51,3 +51,24 @@ def test_equal_shares_and_half_of_the_people_say_nothing(first, last, chances, s
 def test_what_is_equal_to_rounding_is_equal():
     assert _largest(np.array([0.3, 0.35, 0.35 + 1e-16]), -1) == _largest(np.array([0.1, np.nan]), -1) == "inconclusive"
     assert _largest(np.array([0.3, 0.35, 0.35 + 1e-6]), -1) == "supports"
+
+
+@pytest.mark.parametrize(
+    ("farther", "side", "words"),
+    [
+        ([0.30, 0.40, 0.36, 0.36], "inconclusive", "farther by 0.5 % (95 % interval -6.1 to 7.1) on average"),
+        ([0.50, 0.60, 0.56, 0.56], "supports", "farther by 20.5 % (95 % interval 13.9 to 27.1) on average"),
+        ([0.10, 0.20, 0.16, 0.16], "contradicts", "farther by -19.5 % (95 % interval -26.1 to -12.9) on average"),
+    ],
+)
+def test_individuals_and_halves_are_compared_with_an_interval(farther, side, words):
+    """Distances of four individual optima after a third of the trials; of halves it is 0.35."""
+    distances = np.array([[0.0] * 4, farther, [0.1] * 4])
+    progress = SimpleNamespace(
+        counts=np.array([1, 8, 25]), splits=2, halves=np.full((3, 4), 0.35), individual_to_half=distances
+    )
+    analysis = SimpleNamespace(
+        progress=progress, aggregate=SimpleNamespace(map=SimpleNamespace(rule="bcm", method="by points"))
+    )
+    (item,) = _convergence(SimpleNamespace(analysis=analysis, reference=None))
+    assert item.side == side and words in item.text

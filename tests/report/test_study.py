@@ -123,7 +123,7 @@ def test_other_materials_are_the_others():
         "supports",
         "inconclusive",
     ]
-    assert items[0].text.endswith("(supports: nearer than that).")
+    assert items[0].text.endswith("on average (supports: an interval above 0).")
     assert "76.6 % of the decided comparisons (20 ties;" in items[1].text
     assert [item.side for item in _materials([first])] == ["inconclusive"]
 

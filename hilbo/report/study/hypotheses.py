@@ -2,7 +2,8 @@
 
 Every item is a sentence with its numbers, and whether it supports the hypothesis, contradicts it, or is inconclusive.
 The bounds are stated in the sentence; a tie with the bound is inconclusive, so that a verdict does not depend on the
-direction of a scale. Items are not counted, and none is a test of its own. Only a study that asks for it has this
+direction of a scale. A difference between participants is inconclusive if its 95 % interval contains 0. Items are not
+counted, and none is a test of its own. Only a study that asks for it has this
 section (`[report] hypotheses = true`): the hypotheses are the paper's.
 
     H1  individuals' parameters can be found by asking      H3  individuals need not have converged for that
@@ -15,6 +16,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.stats import t
 
 from hilbo.report.results import misses
 from hilbo.report.validation import Validated, safest
@@ -77,6 +79,33 @@ def _largest(row: np.ndarray, place: int) -> Side:
     return _side(float(row[place]), float(np.delete(row, place).max()))
 
 
+class _Difference(NamedTuple):
+    """Mean of differences (%), one of each participant, with its 95 % interval by Student's t."""
+
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def side(self) -> Side:
+        """ "supports" if all of the interval is above 0, "contradicts" if all of it is below, else "inconclusive"."""
+        return "supports" if self.low > 0 else "contradicts" if self.high < 0 else "inconclusive"
+
+    def __str__(self) -> str:
+        if not np.isfinite(self.low):
+            return f"{self.mean:.1f} %"
+        return f"{self.mean:.1f} % (95 % interval {self.low:.1f} to {self.high:.1f})"
+
+
+def _difference(values: np.ndarray) -> _Difference:
+    """Mean of differences (M,) of as many participants; the interval of fewer than two is unbounded."""
+    mean = float(values.mean()) if len(values) else np.nan
+    if len(values) < 2:
+        return _Difference(mean, -np.inf, np.inf)
+    half = float(t.ppf(0.975, len(values) - 1) * values.std(ddof=1)) / len(values) ** 0.5
+    return _Difference(mean, mean - half, mean + half)
+
+
 def _individuals(results):
     """Generate the evidence for H1: approach to the other participants' optimum, highest responses over the session,
     and the likeliest response at the individual optima.
@@ -92,15 +121,15 @@ def _individuals(results):
     spread = f" ± {totals.std(ddof=1):.2f}" if people > 1 else ""
     longest = int(analysis.cohort.counts().max())
     third = max(longest // 3, 1)
-    early, late = (
-        float((answers & mask)[:, columns].sum() / max(mask[:, columns].sum(), 1))
-        for columns in (slice(0, third), slice(longest - third, longest))
-    )
+    thirds = slice(0, third), slice(longest - third, longest)
+    both = mask[:, thirds[0]].any(axis=1) & mask[:, thirds[1]].any(axis=1)
+    early, late = (100 * (answers & mask)[both, part].sum(axis=1) / mask[both, part].sum(axis=1) for part in thirds)
+    more = _difference(late - early)
     yield Evidence(
-        _side(late, early) if longest >= 6 else "inconclusive",
+        more.side if longest >= 6 else "inconclusive",
         f'Of {longest} trials, {totals.mean():.2f}{spread} were answered "{top}"; in the first third of the session'
-        f" {100 * early:.0f} % of the answers, in the last third {100 * late:.0f} % (supports: more than in the"
-        " first).",
+        f" {early.mean():.0f} % of the answers, in the last third {late.mean():.0f} %, means over participants; more by"
+        f" {more} (supports: an interval above 0).",
     )
     chances = np.asarray(analysis.aggregate.individuals.class_probabilities)
     sides = [_largest(row, -1) for row in chances]
@@ -114,21 +143,16 @@ def _individuals(results):
 
 def _nearer_to_others(progress):
     """Evidence whether individual optima approach the optimum of participants who are not among them, from a third of
-    the trials to the last: by more than two standard errors.
+    the trials to the last.
     """
     row = _early(progress.counts)
     early, late = (100 * progress.individual_to_half[k] for k in (row, -1))
-    nearer = early - late
-    error = nearer.std(ddof=1) / np.sqrt(len(nearer))
-    side: Side = (
-        "supports" if nearer.mean() > 2 * error else "contradicts" if nearer.mean() < -2 * error else "inconclusive"
-    )
+    nearer = _difference(early - late)
     return Evidence(
-        side,
+        nearer.side,
         f"From the optimum of a half of the people without them, individual optima are {np.median(early):.0f} % away"
         f" after {progress.counts[row]} trials and {np.median(late):.0f} % after {progress.counts[-1]} (NRMSE,"
-        f" medians); they come nearer by {nearer.mean():.1f} ± {error:.1f} %"
-        " (supports: by more than two standard errors).",
+        f" medians); they come nearer by {nearer} on average (supports: an interval above 0).",
     )
 
 
@@ -148,11 +172,13 @@ def _population(results):
         individual_misses, _ = misses(study, analysis.aggregate.individuals.x, results.reference)
         mean, _ = misses(study, analysis.aggregate.mean_of_optima, results.reference)
         low, middle, high = np.percentile(individual_misses, [25, 50, 75])
+        farther = _difference(100 * (np.asarray(individual_misses) - float(ours)))
         yield Evidence(
-            _side(min(float(middle), float(mean)), float(ours)),
+            farther.side if farther.side != "supports" or mean > ours else "inconclusive",
             f"From {results.reference_name} the population optimum is {100 * ours:.1f} % away (NRMSE), the individual"
             f" optima {100 * middle:.0f} % (median; quartiles {100 * low:.0f} and {100 * high:.0f} %), their mean"
-            f" {100 * mean:.1f} % (supports: nearer than both the median and the mean).",
+            f" {100 * mean:.1f} %; individual optima are farther by {farther} on average"
+            " (supports: an interval above 0, and their mean is farther too).",
         )
     p = float(best.class_probabilities[-1])
     yield Evidence(
@@ -215,12 +241,13 @@ def _convergence(results):
     half, end, individual = (
         100 * float(np.median(v)) for v in (progress.halves[row], progress.halves[-1], progress.individual_to_half[row])
     )
+    farther = _difference(100 * progress.individual_to_half[row] - half)
     yield Evidence(
-        _side(individual, half),
+        farther.side,
         f"After {progress.counts[row]} trials the optimum of one half of the people{how} is {half:.0f} % (NRMSE,"
         f" median of {progress.splits} random halves) from that of the other half after all trials, and individual"
-        f" optima are {individual:.0f} % from it (supports: the half nearer than the individuals); after all trials the"
-        f" halves are {end:.0f} % apart.",
+        f" optima are {individual:.0f} % from it, farther by {farther} on average (supports: an interval above 0);"
+        f" after all trials the halves are {end:.0f} % apart.",
     )
     if results.reference is not None:
         miss = [
@@ -246,18 +273,20 @@ def _materials(results):
 
 
 def _near(one):
-    """Generate evidence whether the population optimum is nearer to the reference than the median individual one; none
-    without reference.
+    """Generate evidence whether the population optimum is nearer to the reference than individual optima on average;
+    none without reference.
     """
     if one.reference is None:
         return
     analysis = one.analysis
     ours = float(misses(analysis.study, analysis.aggregate.optimum.x, one.reference)[0])
-    individual_miss = float(np.median(misses(analysis.study, analysis.aggregate.individuals.x, one.reference)[0]))
+    individual_misses = np.asarray(misses(analysis.study, analysis.aggregate.individuals.x, one.reference)[0])
+    farther = _difference(100 * (individual_misses - ours))
     yield Evidence(
-        _side(individual_miss, ours),
+        farther.side,
         f"{one.name}: the population optimum is {100 * ours:.1f} % from {one.reference_name}, the median individual one"
-        f" {100 * individual_miss:.0f} % (supports: nearer than that).",
+        f" {100 * float(np.median(individual_misses)):.0f} %, farther by {farther} on average (supports: an interval"
+        " above 0).",
     )
 
 
