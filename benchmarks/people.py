@@ -179,7 +179,8 @@ def by(recipe, data, test, effect=False):
         print(f"{recipe.name}: the search did not end well", flush=True)
     context = jnp.asarray(data.context[test]) if effect else None
     mean, variance = learnt_map(learnt, trials).newcomer(jnp.asarray(data.x[test]), context)
-    return np.asarray(class_probabilities(learnt.model.gp.likelihood, mean, variance, learnt.widths)), learnt.widths
+    chances = class_probabilities(learnt.model.gp.likelihood, mean, variance, learnt.scale)
+    return np.asarray(chances), learnt.scale is not None
 
 
 def of_new_contexts(data):

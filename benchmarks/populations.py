@@ -40,7 +40,7 @@ from hilbo.population.maps import learnt_map, rule_map  # noqa: E402
 from hilbo.population.rules.registry import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
-from hilbo.study.analysis.region import optimum_region  # noqa: E402
+from hilbo.study.analysis.region import hyperparameter_draws, optimum_region  # noqa: E402
 from hilbo.study.cohort import Cohort  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
 from hilbo.study.estimate.aggregate import fit_cohort  # noqa: E402
@@ -122,7 +122,7 @@ def one_study(name, design, seed, with_region=True):
     said = float(optimum.class_probabilities[-1])
     content = {"best": top, "median": median, "rules": rules, "said": said, "is": top - rules[RECOMMENDED]["regret"]}
     if with_region:
-        region = optimum_region(resolved_study, map_, answers, seed)
+        region = optimum_region(resolved_study, map_, hyperparameter_draws(resolved_study, answers, seed), seed)
         held = region.holds(np.asarray(best), resolved_study.gp.kernel)
         content["region"] = {"holds": held, "volume": region.volume}
     return content | {"converged": bool(resolved_study.learnt.converged)}

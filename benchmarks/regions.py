@@ -23,7 +23,7 @@ from rows import Rows
 from hilbo.population.rules.recipes import LEARNT_1
 from hilbo.population.rules.registry import RECOMMENDED
 from hilbo.search.candidates import search_points
-from hilbo.study.analysis.region import optimum_region
+from hilbo.study.analysis.region import hyperparameter_draws, optimum_region
 
 CATEGORIES, FREEDOM = 3, 3  # Matern 3/2: waves are Student's, with 3 degrees of freedom
 
@@ -57,7 +57,7 @@ def one_study(design, seed):
     cohort = cohort_from(answers)
     candidates = search_points(study.space, seed)
     learns, map_, optimum = by_recipe(study, cohort, RECOMMENDED, candidates)
-    region = optimum_region(learns, map_, answers, seed)
+    region = optimum_region(learns, map_, hyperparameter_draws(learns, answers, seed), seed)
     best = highest(study, scene.chance, candidates)
     top, got = (float(scene.chance(x[None, :])[0]) for x in (best, optimum.x))
     return {

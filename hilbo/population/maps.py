@@ -34,6 +34,7 @@ from hilbo.population.shared.features import every_point
 from hilbo.population.shared.hierarchical import Share, few_points, fit_people, learn_share, of_people, shared_posterior
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.posterior import ContextEffects, shared_function
+from hilbo.population.shared.scale_use import ScaleUse
 from hilbo.population.shared.tallies import Tallies, fit_counts, tallied
 
 __all__ = [
@@ -71,8 +72,8 @@ class RuleMap(eqx.Module):
     """Prior variance of one person's function."""
     reach: Float[Array, ""] | None = None
     """By a recipe the largest variance of the map where somebody answered: beyond it no optimum is sought."""
-    widths: bool = eqx.field(static=True, default=False)
-    """Whether people differ in the widths of their middle categories."""
+    scale: ScaleUse | None = None
+    """How people differ in the use of the scale; None if they do not."""
     centred: bool = eqx.field(static=True, default=False)
     """By a recipe whether the optimum is the centre of where joint draws are largest; see `map_optimum`."""
     effects: ContextEffects | None = None
@@ -136,7 +137,7 @@ class RuleMap(eqx.Module):
 
     def class_probabilities(self, likelihood: OrdinalProbit, x: Float[Array, "m d"]) -> Float[Array, "m C"]:
         """Probabilities (m, C) of a new participant's responses at points (m, d), in new contexts."""
-        return class_probabilities(likelihood, *self.newcomer(x), self.widths)
+        return class_probabilities(likelihood, *self.newcomer(x), self.scale)
 
 
 def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[str, Float[Array, ""] | None]:
@@ -159,7 +160,7 @@ def learnt_map(learnt: Learnt, trials: Trials) -> RuleMap:
     reach = jnp.max(jnp.where(trials.mask.reshape(-1), variances, 0.0))
     model = learnt.model
     prior, centred = model.shared + model.own, RULES[learnt.recipe].centred
-    return RuleMap(learnt.recipe, "exact", None, shared, model.share, prior, reach, learnt.widths, centred, effects)
+    return RuleMap(learnt.recipe, "exact", None, shared, model.share, prior, reach, learnt.scale, centred, effects)
 
 
 def rule_map(

@@ -1,60 +1,56 @@
 """Predicted responses of a new participant from a population map, before any response and in sequence.
 
-The new participant's own function is integrated out, and so is the width of the middle categories where it differs
-between participants.
+The new participant's own function is integrated out, and so is that participant's use of the scale where it differs
+between participants (`shared.scale_use`).
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.special import log_ndtr, logsumexp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.population.rules.recipes import WIDTHS
+from hilbo.population.shared.scale_use import WEIGHTS, ScaleUse
 
 __all__ = ["InTurn", "class_probabilities", "in_turn", "log_highest", "predicted_in_turn", "with_variances"]
 
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
-_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
-
 
 def class_probabilities(
-    likelihood: OrdinalProbit, mean: Float[Array, " m"], variance: Float[Array, " m"], widths: bool = False
+    likelihood: OrdinalProbit, mean: Float[Array, " m"], variance: Float[Array, " m"], scale: ScaleUse | None = None
 ) -> Float[Array, "m C"]:
     """Probabilities (m, C) of a new participant's responses, from mean and variance (m,) of that participant's
     function.
 
-    **Arguments:** `widths`: whether the distances between thresholds differ between participants, by the prior of the
-    recipes (log-normal); they are then integrated out by Gauss-Hermite quadrature with 7 nodes.
+    **Arguments:** `scale`: how participants differ in the use of the scale, which is integrated out by Gauss-Hermite
+    quadrature with 7 nodes; None if they do not.
     """
-    if not widths:
+    if scale is None:
         return jax.vmap(likelihood.class_probabilities)(mean, variance)
 
-    def given(log_width: Float[Array, ""]) -> Float[Array, "m C"]:
-        person = OrdinalProbit(_widened(likelihood, log_width), likelihood.noise)
-        return jax.vmap(person.class_probabilities)(mean, variance)
+    def given(log_factor: Float[Array, ""]) -> Float[Array, "m C"]:
+        return jax.vmap(scale.of_person(likelihood, log_factor).class_probabilities)(mean, variance)
 
-    return jnp.tensordot(jnp.asarray(_WEIGHTS, mean.dtype), jax.vmap(given)(_log_widths(mean)), 1)
+    return jnp.tensordot(jnp.asarray(WEIGHTS, mean.dtype), jax.vmap(given)(scale.log_factors), 1)
 
 
 def log_highest(
-    likelihood: OrdinalProbit, mean: Float[Array, " m"], variance: Float[Array, " m"], widths: bool = False
+    likelihood: OrdinalProbit, mean: Float[Array, " m"], variance: Float[Array, " m"], scale: ScaleUse | None = None
 ) -> Float[Array, " m"]:
     """Log probability (m,) of the highest category for a new participant, accurate also where it is small.
 
-    `mean`, `variance` (m,): of that participant's function; `widths`: whether the distances between thresholds differ
-    between participants, by the prior of the recipes; they are then integrated out by quadrature with 7 nodes.
+    `mean`, `variance` (m,): of that participant's function; `scale` as for `class_probabilities`.
     """
-    spread = jnp.sqrt(likelihood.noise**2 + variance)
-    if not widths:
-        return log_ndtr((mean - likelihood.thresholds[-1]) / spread)
-    highest = jax.vmap(lambda w: _widened(likelihood, w)[-1])(_log_widths(mean))
-    each = log_ndtr((mean[:, None] - highest[None, :]) / spread[:, None])
-    return logsumexp(each, axis=1, b=jnp.asarray(_WEIGHTS, mean.dtype)[None, :])
+
+    def given(person: OrdinalProbit) -> Float[Array, " m"]:
+        return log_ndtr((mean - person.thresholds[-1]) / jnp.sqrt(person.noise**2 + variance))
+
+    if scale is None:
+        return given(likelihood)
+    each = jax.vmap(lambda w: given(scale.of_person(likelihood, w)))(scale.log_factors)
+    return logsumexp(each, axis=0, b=jnp.asarray(WEIGHTS, mean.dtype)[:, None])
 
 
 def with_variances(covariance: Float[Array, "m m"], variance: Float[Array, " m"]) -> Float[Array, "m m"]:
@@ -81,14 +77,14 @@ def predicted_in_turn(
     covariance: Float[Array, "n n"],
     q: Int[Array, " n"],
     mask: Bool[Array, " n"],
-    widths: bool = False,
+    scale: ScaleUse | None = None,
 ) -> InTurn:
     """Predict a new participant's n responses one after the other, each from those before it.
 
     The participant's function at the n points is normal with `mean` (n,) and `covariance` (n, n) before any response.
     Each response `q` (n,) that was given (`mask`, (n,)) updates both (assumed density filtering), in O(n^3) for all
-    responses; one that was not given changes nothing. `widths` as for `class_probabilities`: their nodes are weighted
-    by the probability of the responses so far.
+    responses; one that was not given changes nothing. `scale` as for `class_probabilities`: its nodes are weighted by
+    the probability of the responses so far.
 
     A session chooses stimuli by what its participant responded before. The participants tested at a stimulus are then
     not a random sample, and only a prediction that uses their earlier responses can be calibrated.
@@ -97,12 +93,11 @@ def predicted_in_turn(
     Neural Networks, ch. 16, for the filter.
     """
 
-    def given(log_width: Float[Array, ""]) -> InTurn:
-        return in_turn(OrdinalProbit(_widened(likelihood, log_width), likelihood.noise), mean, covariance, q, mask)
-
-    if not widths:
+    if scale is None:
         return in_turn(likelihood, mean, covariance, q, mask)
-    each, weights = jax.vmap(given)(_log_widths(mean)), jnp.log(jnp.asarray(_WEIGHTS, mean.dtype))
+    people = jax.vmap(lambda w: scale.of_person(likelihood, w))(scale.log_factors)
+    each = jax.vmap(lambda person: in_turn(person, mean, covariance, q, mask))(people)
+    weights = jnp.log(jnp.asarray(WEIGHTS, mean.dtype))
     logs = jnp.cumsum(jnp.where(mask, each.log_given, 0.0), axis=1)
     before = weights[:, None] + jnp.pad(logs[:, :-1], ((0, 0), (1, 0)))
     share = jax.nn.log_softmax(before, axis=0)
@@ -146,14 +141,3 @@ def in_turn(
 
     start = mean, jnp.zeros_like(covariance), jnp.zeros_like(mean)
     return jax.lax.scan(answer, start, jnp.arange(q.size))[1]
-
-
-def _log_widths(like: Array) -> Float[Array, " nodes"]:
-    """Nodes (7,) of Gauss-Hermite quadrature for the log width of the middle categories, in the dtype of `like`."""
-    return WIDTHS.mean + WIDTHS.sd * jnp.asarray(_NODES, like.dtype)
-
-
-def _widened(likelihood: OrdinalProbit, log_width: Float[Array, ""]) -> Float[Array, " edges"]:
-    """Thresholds (C - 1,) with their distances from their mean multiplied by exp(log_width)."""
-    middle = jnp.mean(likelihood.thresholds)
-    return middle + jnp.exp(log_width) * (likelihood.thresholds - middle)

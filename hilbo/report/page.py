@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from hilbo.population.rules.registry import RULES
+from hilbo.population.rules.registry import RECOMMENDED, RULES
 from hilbo.report.kernel_words import covariance_words, formula
 from hilbo.report.participants import People
 from hilbo.study.config import Study
@@ -111,7 +111,7 @@ def _environment() -> Environment:
         "listed": _listed,
     }
     environment.globals |= {"heads": heads, "zip": zip, "estimate_words": estimate_words}
-    environment.globals |= {"covariance_words": covariance_words, "formula": formula}
+    environment.globals |= {"covariance_words": covariance_words, "formula": formula, "recommended": RECOMMENDED}
     return environment
 
 

@@ -29,6 +29,7 @@ from hilbo.search.rendering import K0_range, Rendering
 from hilbo.study.analysis.cohort_results import CohortResults
 from hilbo.study.analysis.effects import effects_of
 from hilbo.study.analysis.heterogeneity import heterogeneity, how_aggregated, rule_warnings
+from hilbo.study.analysis.highest_answer import HighestAnswer
 from hilbo.study.analysis.model_check import check_sentences
 from hilbo.study.analysis.region import Region, region_content, region_sentences
 from hilbo.study.config import Study
@@ -98,13 +99,14 @@ def result(
     *,
     region: Region | None = None,
     check: Content | None = None,
+    highest: HighestAnswer | None = None,
 ) -> Content:
     """The content of result.json of an aggregation; nothing is written.
 
     **Arguments:** `truth`: true optimum (d,) in the unit cube, if known; `people`: of `people_of`, else computed here;
-    `left_out`: sentences on excluded participants, which become the first warnings; `region`, `check`: of
-    `CohortResults`. With more than `MANY` participants, "participants" is the record `people` itself, which
-    `write_result` writes piece by piece.
+    `left_out`: sentences on excluded participants, which become the first warnings; `region`, `check`,
+    `highest`: of `CohortResults`. With more than `MANY` participants, "participants" is the record `people` itself,
+    which `write_result` writes piece by piece.
     """
     people = people_of(study, aggregate) if people is None else people
     best = aggregate.optimum
@@ -117,7 +119,7 @@ def result(
         },
         "mean_of_optima": None if aggregate.own is None else _mean_of_optima(study, aggregate.mean_of_optima),
         "rule": study.rule,
-        "learnt": learnt_content(study, people.names),
+        "learnt": learnt_content(study, people.names, aggregate.map),
         "random_effect": _random_effect(study, aggregate),
         "heterogeneity": heterogeneity(aggregate),
         "inference": study.inference,
@@ -133,6 +135,7 @@ def result(
     content["warnings"] = warnings + region_sentences(region) + check_sentences(check)
     content["optimum_region"] = region_content(study, region)
     content["model_check"] = check
+    content["highest_answer"] = None if highest is None else highest._asdict()
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content
@@ -296,7 +299,8 @@ def cohort_content(
 ) -> Content:
     """The content of result.json of an analysed cohort; arguments as for `result`. Nothing is written."""
     study, aggregate, seed = population.study, population.aggregate, population.seed
-    return result(study, aggregate, seed, truth, people, left_out, region=population.region, check=population.check)
+    analysed = {"region": population.region, "check": population.check, "highest": population.highest}
+    return result(study, aggregate, seed, truth, people, left_out, **analysed)
 
 
 def write_numbers(content: Content, people: People, grid: xr.Dataset, folder: Path) -> None:

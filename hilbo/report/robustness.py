@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from hilbo.population.rules.registry import RECOMMENDED, RULES
+from hilbo.population.rules.registry import RULES
 from hilbo.report.page import Pictures, rendered
 from hilbo.report.result_file import write_result
 from hilbo.report.results import optimum_content, save_figures, versions
@@ -66,7 +66,6 @@ def robustness_page(study: Study, content: Content, figures: Pictures) -> str:
         limit=LIMIT,
         near=NEAR,
         top=study.responses[-1],
-        recommended=RECOMMENDED,
         learns=RULES[study.rule].learns,
         sensitivity={name: np.atleast_2d(np.asarray(block).T) for name, block in blocks.items()},
         how=content["aggregated"],

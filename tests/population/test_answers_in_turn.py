@@ -13,9 +13,10 @@ from scipy.stats import multivariate_normal, norm
 from hilbo import RBF, OrdinalProbit
 from hilbo.kernels import gram
 from hilbo.population import newcomer
-from hilbo.population.newcomer import _WEIGHTS, _log_widths, _widened
+from hilbo.population.shared.scale_use import WEIGHTS, ScaleUse
 
 LIKELIHOOD = OrdinalProbit(jnp.array([-0.5, 0.8]), jnp.asarray(0.7))
+WIDTHS, SENSITIVITY = ScaleUse(jnp.asarray(0.4)), ScaleUse(jnp.asarray(0.5), True)
 N, Q = 4, np.array([0, 2, 1, 2])
 ALL = jnp.ones(N, bool)
 class_probabilities, predicted_in_turn = map(eqx.filter_jit, (newcomer.class_probabilities, newcomer.predicted_in_turn))
@@ -27,32 +28,32 @@ def with_guesses(mean, covariance, q, lapse):
     return newcomer.in_turn(LIKELIHOOD, mean, covariance, q, ALL, lapse)
 
 
-def boxes(thresholds, mean, covariance):
+def boxes(person, mean, covariance):
     """Probability of the first i answers Q, and of each answer after them, (n, C): boxes of a multivariate normal."""
-    ends = np.array([-np.inf, *thresholds, np.inf])
+    ends = np.array([-np.inf, *np.asarray(person.thresholds), np.inf])
 
     def box(answers):
         k = len(answers)
-        noisy = covariance[:k, :k] + 0.7**2 * np.eye(k)
+        noisy = covariance[:k, :k] + float(person.noise) ** 2 * np.eye(k)
         return multivariate_normal(mean[:k], noisy, seed=0).cdf(ends[answers + 1], lower_limit=ends[answers])
 
     return np.array([[box(np.array([*Q[:i], c])) for c in range(3)] for i in range(N)])
 
 
-@pytest.mark.parametrize("widths", [False, True])
-def test_answers_are_predicted_from_those_before(widths):
+@pytest.mark.parametrize("scale", [None, WIDTHS, SENSITIVITY])
+def test_answers_are_predicted_from_those_before(scale):
     rng = np.random.default_rng(0)
     x, mean = jnp.asarray(rng.uniform(size=(N, 2))), rng.normal(size=N)
     covariance = np.asarray(gram(RBF(3.0, 4.0), x, x))
     predicted, log_given = map(
         np.asarray,
-        predicted_in_turn(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(covariance), jnp.asarray(Q), ALL, widths),
+        predicted_in_turn(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(covariance), jnp.asarray(Q), ALL, scale),
     )
-    people = [_widened(LIKELIHOOD, w) for w in _log_widths(jnp.asarray(mean))] if widths else [LIKELIHOOD.thresholds]
-    weights = _WEIGHTS if widths else [1.0]
-    joint = sum(w * boxes(np.asarray(t), mean, covariance) for w, t in zip(weights, people, strict=True))
+    people = [LIKELIHOOD] if scale is None else [scale.of_person(LIKELIHOOD, w) for w in scale.log_factors]
+    weights = [1.0] if scale is None else WEIGHTS
+    joint = sum(w * boxes(person, mean, covariance) for w, person in zip(weights, people, strict=True))
     np.testing.assert_allclose(predicted, joint / joint.sum(axis=1, keepdims=True), atol=0.02)
-    alone = np.asarray(class_probabilities(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(np.diagonal(covariance)), widths))
+    alone = np.asarray(class_probabilities(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(np.diagonal(covariance)), scale))
     np.testing.assert_allclose(predicted[0], alone[0], rtol=1e-12)
     assert np.abs(predicted[1:] - alone[1:]).max() > 0.1
     np.testing.assert_allclose(np.exp(log_given), predicted[np.arange(N), Q], rtol=1e-12)
@@ -66,12 +67,12 @@ def test_what_was_not_asked_says_nothing():
     np.testing.assert_allclose(last, class_probabilities(LIKELIHOOD, mean, jnp.diagonal(covariance)), rtol=1e-10)
 
 
-@pytest.mark.parametrize("widths", [False, True])
-def test_an_answer_that_was_all_but_excluded_is_a_number(widths):
+@pytest.mark.parametrize("scale", [None, WIDTHS])
+def test_an_answer_that_was_all_but_excluded_is_a_number(scale):
     """Of probability exp(-1000) and less, with most widths or with all."""
     mean, covariance = jnp.array([0.0, 45.0, 0.0, 3.0]), 0.3 * jnp.eye(4)
     given = jnp.array([1, 0, 1, 2]), ALL
-    predicted, log_given = map(np.asarray, predicted_in_turn(LIKELIHOOD, mean, covariance, *given, widths))
+    predicted, log_given = map(np.asarray, predicted_in_turn(LIKELIHOOD, mean, covariance, *given, scale))
     np.testing.assert_allclose(predicted.sum(axis=1), 1.0, rtol=1e-6)
     assert np.isfinite(log_given).all() and -3000 < log_given[1] < -300 and (log_given[2:] > -3).all()
 

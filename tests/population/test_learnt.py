@@ -10,7 +10,7 @@ from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
 from hilbo.kernels import Matern32
 from hilbo.population.learnt.posterior import KERNELS, NOTHING, Stated, medians, model_at, prior_model
-from hilbo.population.learnt.rule import drawn_functions, learn, learnt_function
+from hilbo.population.learnt.rule import drawn_maps, learn, learnt_function
 from hilbo.population.learnt.search import first_search, searched
 from hilbo.population.rules.recipes import LEARNT_1, LEARNT_2
 from hilbo.population.shared.hierarchical import fit_people, of_people, shared_posterior
@@ -98,23 +98,23 @@ def test_curvature_gives_the_standard_deviations(learnt):
     np.testing.assert_allclose(said, by_differences, rtol=0.05)
 
 
-def test_drawn_functions_have_the_hyperparameters_of_the_posterior(learnt):
-    drawn = drawn_functions(learnt, answers(), NOTHING, 0, 100)
+def test_drawn_maps_have_the_hyperparameters_of_the_posterior(learnt):
+    drawn = drawn_maps(learnt, answers(), NOTHING, 0, 100)
     assert len(drawn) == 100
-    log_theta = np.log([np.asarray(each.gp.kernel.theta) for each in drawn])
+    log_theta = np.log([np.asarray(each.function.gp.kernel.theta) for each in drawn])
     learnt_theta = np.log(np.asarray(learnt.model.theta))
     standardised = (log_theta - learnt_theta) / np.asarray(learnt.sd["theta"])
     np.testing.assert_allclose(standardised.mean(axis=0), 0.0, atol=0.4)  # 4 standard errors
     np.testing.assert_allclose(standardised.std(axis=0), 1.0, atol=0.3)
     correlation = learnt.covariance[-2, -1] / np.prod(np.asarray(learnt.sd["theta"]))
     np.testing.assert_allclose(np.corrcoef(log_theta.T)[0, 1], correlation, atol=0.4)
-    means = np.stack([np.asarray(each.predict(np.full((1, 2), 0.5))[0]) for each in drawn[:2]])
+    means = np.stack([np.asarray(each.function.predict(np.full((1, 2), 0.5))[0]) for each in drawn[:2]])
     assert means[0] != means[1]
 
 
 def test_no_functions_are_drawn_where_the_search_ended_at_no_maximum(learnt):
     saddle = eqx.tree_at(lambda each: each.covariance, learnt, learnt.covariance.at[0, 0].multiply(-1.0))
-    assert drawn_functions(saddle, answers(), NOTHING, 0, 4) == []
+    assert drawn_maps(saddle, answers(), NOTHING, 0, 4) == []
 
 
 def test_the_map_is_that_of_the_dense_model(learnt):
@@ -206,6 +206,6 @@ def test_widths_are_found_where_people_have_them():
         half = 2.2 if j % 2 else 0.25
         each.append(Trials.from_arrays(x, (felt > 0.5 - half).astype(int) + (felt > 0.5 + half), 60))
     end = learn(jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *each), 3)
-    assert end.gain_of_widths > 3
+    assert end.gain_of_factors > 3
     widths = np.asarray(end.coordinates["widths"])
     assert widths[1::2].min() > widths[::2].max() + 0.5

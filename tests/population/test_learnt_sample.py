@@ -61,7 +61,7 @@ def test_people_outside_of_the_sample_have_widths_of_their_own():
     trials = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *each)
     some = learn_from_sample(trials, 3, recipe=LEARNT_2, most=7)
     widths = np.asarray(some.model.log_widths)
-    assert some.widths and bool(some.converged) and widths[1::2].min() > widths[::2].max() + 0.5
+    assert some.scale is not None and bool(some.converged) and widths[1::2].min() > widths[::2].max() + 0.5
     np.testing.assert_array_equal(some.coordinates["widths"], widths)
     assert np.all(np.asarray(some.sd["widths"]) < 1)
     assert bool(learnt_function(some, trials).function.certificate.converged)

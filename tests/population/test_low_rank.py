@@ -1,5 +1,7 @@
 """The hierarchical model by features: against the dense model, its limits, and differences of its own evidence."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -120,6 +122,18 @@ def test_widths_are_thresholds_of_their_own():
         thresholds = 0.05 + np.exp(log_width) * np.array([-0.45, 0.45])
         gp = OrdinalGP(RBF((3.0, 5.0), 0.9), OrdinalProbit(thresholds, 0.7))
         total += float(alone(gp, jax.tree.map(lambda leaf, j=j: np.asarray(leaf)[j], trials)))
+    np.testing.assert_allclose(evidence(people, apart(trials)).value, total, rtol=1e-12)
+
+
+def test_sensitivities_scale_thresholds_and_noise_about_the_highest():
+    """Nothing shared: everybody's evidence is that of a fit with their own thresholds and noise."""
+    factors = (0.4, -0.3, 0.0)
+    trials, alike = stacked(), model(shared=0.0, own=0.9, log_widths=factors)
+    people, total = dataclasses.replace(alike, sensitivity=True), 0.0
+    for j, factor in enumerate(np.exp(factors)):
+        likelihood = OrdinalProbit(0.5 + factor * np.array([-0.9, 0.0]), factor * 0.7)
+        person = jax.tree.map(lambda leaf, j=j: np.asarray(leaf)[j], trials)
+        total += float(alone(OrdinalGP(RBF((3.0, 5.0), 0.9), likelihood), person))
     np.testing.assert_allclose(evidence(people, apart(trials)).value, total, rtol=1e-12)
 
 

@@ -19,6 +19,7 @@ from hilbo.likelihoods import OrdinalProbit
 from hilbo.population import newcomer
 from hilbo.population.maps import RuleMap, point_rule
 from hilbo.population.rules.registry import POINTWISE
+from hilbo.population.shared.scale_use import ScaleUse
 from hilbo.report.figures import regions
 from hilbo.report.figures import study as plotting_study
 from hilbo.report.figures.maps import Slice
@@ -148,29 +149,35 @@ MEAN, VARIANCE = jnp.array([0.3, -1.0, 4.0]), jnp.array([0.2, 0.5, 2.0])
 class_probabilities, log_highest = map(eqx.filter_jit, (newcomer.class_probabilities, newcomer.log_highest))
 
 
-def by_quadrature(mean, variance, category):
-    """Over the log width, N(0, 0.4^2)."""
+WIDTHS, SENSITIVITY = ScaleUse(jnp.asarray(0.4)), ScaleUse(jnp.asarray(0.4), True)
+
+
+def by_quadrature(mean, variance, category, pivot):
+    """Over the log factor, N(0, 0.4^2): of the widths, or of a function that is divided by it about the pivot."""
     edges = np.array([-np.inf, -0.5, 0.2, 1.3, np.inf])
-    middle = edges[1:4].mean()
-    spread = np.sqrt(0.8**2 + variance)
 
     def given(w):
-        low, high = middle + np.exp(w) * (edges[category : category + 2] - middle)
-        return (norm.cdf((high - mean) / spread) - norm.cdf((low - mean) / spread)) * norm.pdf(w, 0.0, 0.4)
+        if pivot is None:
+            ends, at, variance_at = edges[1:4].mean() * (1 - np.exp(w)) + np.exp(w) * edges, mean, variance
+        else:
+            ends, at, variance_at = edges, pivot + (mean - pivot) / np.exp(w), variance / np.exp(2 * w)
+        low, high = (ends[category : category + 2] - at) / np.sqrt(0.8**2 + variance_at)
+        return (norm.cdf(high) - norm.cdf(low)) * norm.pdf(w, 0.0, 0.4)
 
     return quad(given, -4.0, 4.0, epsabs=1e-12)[0]
 
 
-def test_widths_are_integrated_out():
+@pytest.mark.parametrize(("scale", "pivot"), [(WIDTHS, None), (SENSITIVITY, 1.3)])
+def test_the_use_of_the_scale_is_integrated_out(scale, pivot):
     pairs = zip(*map(np.asarray, (MEAN, VARIANCE)), strict=True)
-    expected = [[by_quadrature(*pair, c) for c in range(4)] for pair in pairs]
-    np.testing.assert_allclose(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, True), expected, atol=2e-5)
+    expected = [[by_quadrature(*pair, c, pivot) for c in range(4)] for pair in pairs]
+    np.testing.assert_allclose(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, scale), expected, atol=3e-4)
 
 
-@pytest.mark.parametrize("widths", [False, True])
-def test_the_highest_category_is_the_last_one(widths):
-    chances = np.asarray(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, widths))
-    np.testing.assert_allclose(np.exp(log_highest(LIKELIHOOD, MEAN, VARIANCE, widths)), chances[:, -1], rtol=1e-12)
+@pytest.mark.parametrize("scale", [None, WIDTHS, SENSITIVITY])
+def test_the_highest_category_is_the_last_one(scale):
+    chances = np.asarray(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, scale))
+    np.testing.assert_allclose(np.exp(log_highest(LIKELIHOOD, MEAN, VARIANCE, scale)), chances[:, -1], rtol=1e-12)
 
 
 def test_the_highest_category_far_below():

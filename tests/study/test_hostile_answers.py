@@ -11,7 +11,7 @@ from studies import SOUND
 from hilbo.ordinal_gp import Trials
 from hilbo.report.results import result
 from hilbo.study.analysis.model_check import model_check
-from hilbo.study.analysis.region import optimum_region
+from hilbo.study.analysis.region import hyperparameter_draws, optimum_region
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import aggregate_cohort
@@ -51,7 +51,7 @@ def said(rule):
     def of(answers):
         learnt = resolved(study, answers)
         aggregate = aggregate_cohort(learnt, answers, alternatives=False)
-        region = optimum_region(learnt, aggregate.map, answers.trials)
+        region = optimum_region(learnt, aggregate.map, hyperparameter_draws(learnt, answers.trials))
         content = result(learnt, aggregate, 0, region=region, check=model_check(learnt, aggregate))
         unit = np.array(content["optimum"]["unit"])
         assert np.isfinite(unit).all() and ((unit >= 0) & (unit <= 1)).all()

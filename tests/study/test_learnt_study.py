@@ -87,7 +87,7 @@ def test_learnt_2_seeks_its_optimum_where_the_best_is_most_often_near(learnt_2):
     chance = np.asarray(eqx.filter_jit(map_.class_probabilities)(study.gp.likelihood, x))[:, -1]
     known = np.asarray(map_.predict(x)[1]) <= np.asarray(map_.reach)
     known = known & (chance >= chance[known].max() - 0.05)
-    assert learnt_content(study, cohort.names)["recipe"] == "learnt-2"
+    assert learnt_content(study, cohort.names, map_)["recipe"] == "learnt-2"
     assert float(nearness(map_.shared.gp.kernel, places.points, places.share, optimum.x)) >= near[known].max() - 1e-12
     assert float(optimum.class_probabilities[-1]) >= chance[known].max() - 0.05 - 1e-6
     assert float(optimum.sd**2) <= float(map_.reach) * (1 + 1e-6)
@@ -127,13 +127,14 @@ def test_results_hold_the_resolved_recipe(table):
     cohort = cohort_of(read_trials(table, study), study)
     learnt = resolved(study, cohort)
     assert resolved(learnt, cohort) is learnt
-    content = learnt_content(learnt, cohort.names)
+    map_ = learnt_map(learnt.learnt, cohort.trials)
+    content = learnt_content(learnt, cohort.names, map_)
     assert content is not None
     json.dumps(content, allow_nan=False)
-    assert content["recipe"] == "learnt-1"
+    assert content["recipe"] == "learnt-1" and content["log_evidence"] == float(map_.shared.log_evidence)
     assert set(content["theta"]) == {"level", "tone"}
     assert set(content["intervals"]) == {"theta.level", "theta.tone", "shared", "own", "middle", "gap 1"}
-    assert learnt_content(study, cohort.names) is None
+    assert learnt_content(study, cohort.names, map_) is None
     assert learnt_sentences(study) == []
 
 
@@ -163,7 +164,7 @@ def test_a_random_effect_is_read_from_its_column_and_stands_in_the_results(learn
     learnt, cohort, map_ = learnt_2
     assert cohort.contexts == ("Fox", "Sea", "Wolf")
     np.testing.assert_array_equal(cohort.trials.context[0, :4], [0, 1, 0, 1])
-    assert "random effect" in learnt_content(learnt, cohort.names)["intervals"]
+    assert "random effect" in learnt_content(learnt, cohort.names, map_)["intervals"]
 
     def levels(of):
         content = effect_content(learnt, of, map_)

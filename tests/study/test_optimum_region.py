@@ -23,9 +23,7 @@ def region_of(count, seed=0, points=80):
     felt = 2.0 - 12.0 * ((x - [0.3, 0.6]) ** 2).sum(axis=1) + 0.5 * rng.normal(size=count)
     posterior = fit(gp, Trials.from_arrays(x, (felt > -0.5).astype(int) + (felt > 0.5), 64))
     one = jnp.ones(())
-    return optimum_region(
-        STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), posterior.trials, seed, points
-    )
+    return optimum_region(STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), (), seed, points)
 
 
 def test_more_answers_leave_less_and_hold_the_best():
@@ -69,7 +67,7 @@ def test_of_levels_and_whole_numbers_each_rendering_counts_once():
     one = jnp.ones(())
     for seed in (0, 1):
         map_ = RuleMap("pooled", "exact", None, posterior, one, 4.0 * one)
-        region = optimum_region(study, map_, posterior.trials, seed, 80)
+        region = optimum_region(study, map_, (), seed, 80)
         assert region is not None
         places = np.concatenate([region.points, region.others])
         assert len(np.unique(places, axis=0)) == len(places) == 21
@@ -80,7 +78,7 @@ def test_of_levels_and_whole_numbers_each_rendering_counts_once():
 
 def test_maps_by_points_have_none():
     one = jnp.ones(())
-    assert optimum_region(STUDY, RuleMap("bcm", "by points", None, None, one, one), NOBODY) is None
+    assert optimum_region(STUDY, RuleMap("bcm", "by points", None, None, one, one)) is None
     assert region_content(STUDY, None) is None
 
 
@@ -116,9 +114,7 @@ def test_the_best_is_in_it_as_often_as_it_says():
         z = f[:40] + 0.5 * rng.normal(size=40)
         posterior = fit(gp, Trials.from_arrays(x[:40], (z > -0.5).astype(int) + (z > 0.5), 64))
         one = jnp.ones(())
-        region = optimum_region(
-            STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), posterior.trials, seed, count=200
-        )
+        region = optimum_region(STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), (), seed, count=200)
         assert region is not None
         held += region.holds(grid[np.argmax(f[40:])], RBF(THETA))
     assert held >= 0.95 * 25 - 3 * np.sqrt(25 * 0.95 * 0.05)

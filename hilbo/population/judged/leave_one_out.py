@@ -278,7 +278,7 @@ def _newcomer(
         of_context = jnp.sqrt(effects.variance[context])
         together = jnp.where(context[:, None] == context[None, :], jnp.outer(of_context, of_context), 0.0)
         covariance = with_variances(covariance, population_map.predict(x)[1] + apart) + together
-    return predicted_in_turn(gp.likelihood, mean, with_variances(covariance, variance), q, mask, population_map.widths)
+    return predicted_in_turn(gp.likelihood, mean, with_variances(covariance, variance), q, mask, population_map.scale)
 
 
 def _converged(map_: RuleMap) -> bool:

@@ -83,6 +83,9 @@ class Problem(eqx.Module):
     """Of the shared function's features."""
     theta: Float[Array, " d"]
     """By which they were chosen."""
+    information: Float[Array, " M"] | None = None
+    """Curvature (M,), at least 0, of the log evidence in each participant's log factor, with which Laplace's method
+    integrates these out; the spread of sensitivities could not be learnt from their maximum."""
 
 
 class Cost(NamedTuple):
@@ -145,9 +148,11 @@ def medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior], kerne
         "widths": jnp.full(people, priors["widths"].mean, dtype),
         "effect": jnp.asarray(priors["effect"].mean, dtype),
     }
+    if "sensitivity" in priors:
+        every["sensitivity"] = jnp.asarray(priors["sensitivity"].mean, dtype)
     kept = {"theta"} if stated.theta is not None else set()
     kept |= {"middle", "gaps"} if stated.thresholds is not None else set()
-    kept |= {"widths"} if categories < 3 else set()
+    kept |= {"widths"} if categories < 3 and "sensitivity" not in priors else set()
     kept |= {"effect"} if answers.context is None else set()
     return {name: value for name, value in every.items() if name not in kept and value.size}
 
@@ -179,17 +184,23 @@ def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated, kernel:
         thresholds = jnp.asarray(stated.thresholds, dtype)
     widths = coordinates.get("widths", jnp.zeros(people, dtype))
     effect = noise**2 * jnp.exp(coordinates["effect"]) if "effect" in coordinates else None
-    return PeopleModel(theta, shared, own, thresholds, noise, widths, kernel, stated.counts, effect)
+    sensitivity = "sensitivity" in coordinates
+    return PeopleModel(theta, shared, own, thresholds, noise, widths, kernel, stated.counts, effect, sensitivity)
 
 
 def _log_prior(coordinates: Coordinates, problem: Problem) -> Float[Array, ""]:
-    """Log prior density of the coordinates, up to a constant: a scalar, in nats."""
+    """Log prior density of the coordinates, up to a constant: a scalar, in nats. If the spread of sensitivities is
+    learnt, these have that standard deviation, and the log of the Laplace factor of their integral is added.
+    """
     d = problem.answers.x.shape[-1]
     total = jnp.zeros((), problem.answers.x.dtype)
     for name, value in coordinates.items():
         mean, sd = problem.priors[name]
+        sd = jnp.exp(coordinates["sensitivity"]) if name == "widths" and "sensitivity" in coordinates else sd
         lowered = _lowered(problem.stated, problem.priors[name], problem.kernel, d) if name == "theta" else 0.0
         total -= 0.5 * jnp.sum(((value - mean + lowered) / sd) ** 2)
+    if "sensitivity" in coordinates and problem.information is not None:
+        total -= 0.5 * jnp.sum(jnp.log1p(jnp.exp(2 * coordinates["sensitivity"]) * problem.information))
     return total
 
 

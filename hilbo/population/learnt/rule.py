@@ -1,10 +1,10 @@
 """The hierarchical model with hyperparameters learnt from all responses, by a recipe of `rules.recipes`.
 
 The hyperparameters maximise the Laplace evidence of all responses times the recipe's priors, by L-BFGS from the priors'
-medians, at first with the same widths for all participants; then with individual ones, which are kept if they add 3 or
-more to the log evidence. Hyperparameters that the study specifies are fixed, and with a specified noise, or variance,
-all others are in its unit. Their uncertainty is from a normal approximation of the posterior; one that is hardly
-narrower than its prior is not identified.
+medians, at first with the same use of the scale for all participants; then with individual widths or sensitivities,
+which are kept if they are worth it by the evidence. Hyperparameters that the study specifies are fixed, and with a
+specified noise, or variance, all others are in its unit. Their uncertainty is from a normal approximation of the
+posterior; one that is hardly narrower than its prior is not identified.
 """
 
 from collections.abc import Set
@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hilbo.errors import InputError
 from hilbo.numerics.shown import shown
 from hilbo.ordinal_gp import Posterior, Trials
+from hilbo.population.learnt.factors import FACTORS, FINE, Chosen, with_factors_if_worth
 from hilbo.population.learnt.posterior import (
     KERNELS,
     NOTHING,
@@ -32,22 +33,22 @@ from hilbo.population.learnt.posterior import (
     model_at,
 )
 from hilbo.population.learnt.search import LARGEST, Search, first_search, searched
-from hilbo.population.rules.recipes import LEARNT_1, Recipe
+from hilbo.population.rules.recipes import LEARNT_1, WIDTHS, Recipe
 from hilbo.population.shared.features import pivots_for, unexplained
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.posterior import SharedFunction, shared_function
+from hilbo.population.shared.scale_use import ScaleUse
 from hilbo.population.shared.tallies import Tallies, tallied
 
 __all__ = [
+    "DrawnMap",
     "Learnt",
-    "drawn_functions",
+    "drawn_maps",
     "learn",
     "learnt_function",
     "not_learnt",
 ]
 
-_FINE = 1e-3  # of the finite differences for the curvature
-_WORTH = 3.0  # log Bayes factor from which people have widths of their own, about 20 to 1
 _ROUGH = 0.05
 _AT_A_TIME = 2  # draws: much of their arithmetic is of one core
 _MOST_FEATURES, _NUMBERS = 1024, 64_000_000  # of the shared function; of all people's features, half a gigabyte
@@ -71,8 +72,9 @@ class Learnt(eqx.Module):
     """Standard deviations of their posterior."""
     covariance: Float[Array, "k k"]
     """Of their posterior, without widths: one after the other, as `ravel_pytree` has them."""
-    gain_of_widths: Float[Array, ""]
-    """What widths of people's own add to the log evidence; they are in the model if it is above 3."""
+    gain_of_factors: Float[Array, ""]
+    """What individual widths, or sensitivities, add to the log evidence; they are in the model if it is more than the
+    recipe's `worth`."""
     steps: Int[Array, ""]
     rank: Int[Array, ""]
     left: Float[Array, ""]
@@ -88,9 +90,9 @@ class Learnt(eqx.Module):
         return f"Learnt({words}, log evidence {shown(self.log_evidence)}, converged {sure})"
 
     @property
-    def widths(self) -> bool:
-        """Whether participants have individual widths of the middle categories."""
-        return "widths" in self.coordinates
+    def scale(self) -> ScaleUse | None:
+        """How participants differ in the use of the scale; None if they do not, by the evidence."""
+        return _scale_at(self.coordinates)
 
 
 def learnt_function(learnt: Learnt, trials: Trials) -> SharedFunction:
@@ -111,8 +113,18 @@ def _as_learnt(learnt: Learnt, trials: Trials) -> Tallies:
     return tallied(trials, learnt.model.thresholds.size + 1, learnt.weights.shape[1])
 
 
-def drawn_functions(learnt: Learnt, trials: Trials, stated: Stated, seed: int, count: int) -> list[Posterior]:
-    """Posteriors of the shared function for `count` draws of the hyperparameters from their normal posterior; widths
+class DrawnMap(NamedTuple):
+    """Posterior of the shared function by drawn hyperparameters, and these: the model, and how participants differ in
+    the use of the scale.
+    """
+
+    function: Posterior
+    model: PeopleModel
+    scale: ScaleUse | None
+
+
+def drawn_maps(learnt: Learnt, trials: Trials, stated: Stated, seed: int, count: int) -> list[DrawnMap]:
+    """Maps for `count` draws of the hyperparameters from their normal posterior; individual widths or sensitivities
     stay.
 
     Draws whose fit does not converge are left out; the list is empty if the covariance is not positive definite, since
@@ -130,14 +142,25 @@ def drawn_functions(learnt: Learnt, trials: Trials, stated: Stated, seed: int, c
     unit, answers = learnt.model.unit, _as_learnt(learnt, trials)
     rank = len(pivots_for(unit, answers).points)
 
-    def function(step: Float[np.ndarray, " k"]) -> Posterior:
-        model = model_at(widths | restore(flat + step), answers, stated, type(unit))
+    def drawn(step: Float[np.ndarray, " k"]) -> DrawnMap:
+        coordinates = widths | restore(flat + step)
+        model = model_at(coordinates, answers, stated, type(unit))
         pivots = pivots_for(model.unit, answers, fewest=rank, most=rank)
-        return jax.block_until_ready(shared_function(model, answers, learnt.weights, pivots).function)
+        function = jax.block_until_ready(shared_function(model, answers, learnt.weights, pivots).function)
+        return DrawnMap(function, model, _scale_at(coordinates))
 
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
-        functions = list(pool.map(function, steps))
-    return [each for each in functions if bool(each.certificate.converged)]
+        maps = list(pool.map(drawn, steps))
+    return [each for each in maps if bool(each.function.certificate.converged)]
+
+
+def _scale_at(coordinates: Coordinates) -> ScaleUse | None:
+    """How participants differ in the use of the scale at these coordinates; None if they do not."""
+    if "widths" not in coordinates:
+        return None
+    if "sensitivity" in coordinates:
+        return ScaleUse(jnp.exp(coordinates["sensitivity"]), sensitivity=True)
+    return ScaleUse(jnp.asarray(WIDTHS.sd, coordinates["widths"].dtype))
 
 
 def learn(
@@ -158,13 +181,13 @@ def learn(
         raise InputError(f"{recipe.name}: nobody gave an answer; at least one person's answers are needed.")
     answers = tallied(trials, categories, 0 if near is None else near.weights.shape[1])
     start = medians(answers, stated, recipe.priors, KERNELS[recipe.kernel])
-    common = frozenset(start) - {"widths"}
+    common = frozenset(start) - FACTORS
     if near is not None:
         start |= {name: near.coordinates[name] for name in common}
     begun, problem = first_search(start, answers, stated, recipe)
     if near is not None and not bool(begun.cost.usable):
         return learn(trials, categories, stated, recipe)
-    chosen = _with_widths_if_worth(*searched(begun, problem, common), frozenset(start))
+    chosen = with_factors_if_worth(*searched(begun, problem, common), frozenset(start), recipe)
     return _recorded(chosen, *_posterior_spread(chosen.search, chosen.problem, chosen.free), recipe)
 
 
@@ -180,10 +203,10 @@ def not_learnt(trials: Trials, categories: int, stated: Stated = NOTHING, recipe
         medians(answers, stated, recipe.priors, KERNELS[recipe.kernel]), answers, stated, recipe
     )
     nothing = jnp.zeros((0, 0), trials.x.dtype)
-    return _recorded(_Chosen(search, problem, frozenset(), 0.0), {}, nothing, recipe)
+    return _recorded(Chosen(search, problem, frozenset(), 0.0), {}, nothing, recipe)
 
 
-def _recorded(chosen: "_Chosen", sd: Coordinates, covariance: Float[Array, "k k"], recipe: Recipe) -> Learnt:
+def _recorded(chosen: "Chosen", sd: Coordinates, covariance: Float[Array, "k k"], recipe: Recipe) -> Learnt:
     """Result of a search, with the standard deviations and the covariance of its coordinates."""
     search, problem, free, gain = chosen
     answers = problem.answers
@@ -197,60 +220,13 @@ def _recorded(chosen: "_Chosen", sd: Coordinates, covariance: Float[Array, "k k"
         coordinates={name: value for name, value in search.coordinates.items() if name in free},
         sd=sd,
         covariance=covariance,
-        gain_of_widths=jnp.asarray(gain),
+        gain_of_factors=jnp.asarray(gain),
         steps=jnp.asarray(search.steps),
         rank=jnp.asarray(len(problem.pivots.points)),
         left=left,
         converged=search.cost.usable & jnp.asarray(search.ended) & (left <= _ROUGH),
         people=len(answers.x),
     )
-
-
-class _Chosen(NamedTuple):
-    """The search that is used, its problem, the coordinates that were free in it, and the gain of log evidence by
-    individual widths.
-    """
-
-    search: Search
-    problem: Problem
-    free: Set[str]
-    gain: float
-
-
-def _with_widths_if_worth(alike: Search, problem: Problem, coordinates: Set[str]) -> _Chosen:
-    """Continue the search `alike`, with equal widths, with individual ones; return it if the log evidence gains more
-    than 3, else `alike`.
-
-    `coordinates`: names of all that are learnt; without "widths" among them nothing is searched, and the gain is 0.
-    """
-    without = _Chosen(alike, problem, coordinates - {"widths"}, 0.0)
-    if "widths" not in coordinates:
-        return without
-    different, its_own = searched(alike, problem, coordinates)
-    same = alike
-    if its_own is not problem:  # costs by other features differ by more than a gain may
-        same = alike._replace(cost=cost_at(alike.coordinates, alike.cost.weights, its_own))
-    gain = _gain_of_widths(same, different, its_own)
-    return _Chosen(different, its_own, coordinates, gain) if gain > _WORTH else without._replace(gain=gain)
-
-
-def _gain_of_widths(alike: Search, different: Search, problem: Problem) -> float:
-    """Gain of log evidence by individual widths, in nats, by Laplace's method with widths that are taken as
-    independent: the row sums of the Hessian replace its diagonal, as in `_posterior_spread`.
-
-    -inf if some curvature is not positive: the search then ended at no maximum. `problem`: of which both costs are.
-    """
-    widths = different.coordinates["widths"]
-
-    def slope(step):
-        moved = different.coordinates | {"widths": widths + step}
-        return np.asarray(cost_at(moved, different.cost.weights, problem).gradient["widths"])
-
-    curvature = (slope(_FINE) - slope(-_FINE)) / (2 * _FINE)
-    if not np.all(curvature > 0):
-        return -np.inf
-    gain = float(alike.cost.value - different.cost.value)
-    return gain - float(np.sum(np.log(problem.priors["widths"].sd * np.sqrt(curvature))))
 
 
 def _posterior_spread(search: Search, problem: Problem, free: Set[str]) -> tuple[Coordinates, Float[Array, "k k"]]:
@@ -268,9 +244,9 @@ def _posterior_spread(search: Search, problem: Problem, free: Set[str]) -> tuple
     flat, restore = ravel_pytree(common)
 
     def difference(way: Coordinates) -> Coordinates:
-        moved = coordinates | {name: coordinates[name] + _FINE * step for name, step in way.items()}
+        moved = coordinates | {name: coordinates[name] + FINE * step for name, step in way.items()}
         ahead = cost_at(moved, end.weights, problem).gradient
-        return jax.tree.map(lambda a, b: (a - b) / _FINE, ahead, end.gradient)
+        return jax.tree.map(lambda a, b: (a - b) / FINE, ahead, end.gradient)
 
     def of_common(moved: Coordinates) -> np.ndarray:
         return np.asarray(ravel_pytree({name: moved[name] for name in common})[0])

@@ -47,7 +47,7 @@ def learn_from_sample(
     weights = np.zeros((people, room))
     weights[rows, : learnt.weights.shape[1]] = learnt.weights
     widths, sd, ended = np.zeros(people), np.zeros(people), True
-    if learnt.widths:
+    if learnt.scale is not None:
         widths[rows], sd[rows] = learnt.coordinates["widths"], learnt.sd["widths"]
         others = np.setdiff1d(np.arange(people), rows)
         for block in np.array_split(others, -(-len(others) // most)):

@@ -7,22 +7,23 @@ name.
 In units of the classification noise, with d parameters and C categories, people's functions and answers are those of
 `people_model.PeopleModel`. The priors of the hyperparameters:
 
-    coordinate                                   learnt-1            learnt-2
-    kernel                                       RBF                 Matern 3/2
-    log theta_i                                  log(24 / d), 1.2    the same
-    log shared variance                          log 3, 1            log 3, 2
-    log own variance                             0, 1                0, 2
-    middle of the thresholds                     0, 1.5              0, 4
-    log distance of neighbouring thresholds      log 0.8, 0.7        log 0.8, 2
-    log width_j of a person, if C > 2            0, 0.4              the same
-    log variance of a random effect, if any      0, 2                the same
+    coordinate                                   learnt-1            learnt-2            learnt-3
+    kernel                                       RBF                 Matern 3/2          Matern 3/2
+    log theta_i                                  log(24 / d), 1.2    the same            the same
+    log shared variance                          log 3, 1            log 3, 2            log 3, 2
+    log own variance                             0, 1                0, 2                0, 2
+    middle of the thresholds                     0, 1.5              0, 4                0, 4
+    log distance of neighbouring thresholds      log 0.8, 0.7        log 0.8, 2          log 0.8, 2
+    log width_j of a person, if C > 2            0, 0.4              the same            none
+    log sensitivity_j of a person                none                none                0, spread
+    log spread of the sensitivities              none                none                log 0.3, 1
+    log variance of a random effect, if any      0, 2                the same            the same
 """
 
 import math
-from collections.abc import Mapping
 from typing import Final, Literal, NamedTuple
 
-__all__ = ["EFFECT", "LEARNT_1", "LEARNT_2", "WIDTHS", "Prior", "Recipe"]
+__all__ = ["EFFECT", "LEARNT_1", "LEARNT_2", "LEARNT_3", "Prior", "Recipe"]
 
 
 class Prior(NamedTuple):
@@ -38,8 +39,11 @@ class Recipe(NamedTuple):
     name: str
     kernel: Literal["rbf", "matern32"]
     """Of the function that people share, and of everybody's own part."""
-    priors: Mapping[str, Prior]
-    """By the names of `posterior.Coordinates`; that of theta less log d."""
+    priors: dict[str, Prior]
+    """By the names of `posterior.Coordinates`; that of theta less log d. With "sensitivity" participants differ in
+    sensitivity about the highest threshold, whose spread is learnt; otherwise in the widths of middle categories."""
+    worth: float
+    """Gain of log evidence, in nats, from which participants differ in the use of the scale."""
 
 
 WIDTHS: Final = Prior(0.0, 0.4)
@@ -59,6 +63,7 @@ LEARNT_1: Final = Recipe(
         "widths": WIDTHS,
         "effect": EFFECT,
     },
+    3.0,
 )
 LEARNT_2: Final = Recipe(
     "learnt-2",
@@ -72,4 +77,6 @@ LEARNT_2: Final = Recipe(
         "widths": WIDTHS,
         "effect": EFFECT,
     },
+    3.0,
 )
+LEARNT_3: Final = Recipe("learnt-3", "matern32", LEARNT_2.priors | {"sensitivity": Prior(math.log(0.3), 1.0)}, 0.0)

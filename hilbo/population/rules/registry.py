@@ -8,7 +8,7 @@ maps. A new method is a new entry here, with its recipe (`recipes`) if it learns
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
-from hilbo.population.rules.recipes import LEARNT_1, LEARNT_2, Recipe
+from hilbo.population.rules.recipes import LEARNT_1, LEARNT_2, LEARNT_3, Recipe
 
 __all__ = ["DEFAULT", "GIVEN", "POINTWISE", "RECIPES", "RECOMMENDED", "RULES", "WITHDRAWN", "Rule", "RuleName"]
 
@@ -126,6 +126,18 @@ _ALL: Final = (
         pointwise="hierarchical",
         joint=True,
         recipe=LEARNT_2,
+        centred=True,
+    ),
+    Rule(
+        name="learnt-3",
+        label="people who differ, hyperparameters learnt (learnt-3)",
+        description=f"{_LEARNT}learnt-3",
+        sought="the place that the best one is most often near, of those to which a new person gives the highest"
+        " answer at most 0.05 less often than to any",
+        place="the place that the best rendering is most often near",
+        pointwise="hierarchical",
+        joint=True,
+        recipe=LEARNT_3,
         centred=True,
     ),
 )

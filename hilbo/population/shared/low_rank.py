@@ -33,10 +33,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hilbo.gaussian import distance, residual_tolerance
 from hilbo.kernels import gram
-from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.sharding import of_each_person, sharded
 from hilbo.population.shared.features import Pivots, features_of
 from hilbo.population.shared.people_model import PeopleModel
+from hilbo.population.shared.scale_use import with_factor
 from hilbo.population.shared.tallies import Expansion, Tallies, expand_counts
 
 __all__ = [
@@ -145,13 +145,15 @@ def _expand(model: PeopleModel, answers: Tallies, eta: Float[Array, "M n"]) -> E
     n).
     """
 
-    def each(some, noise):
-        def person(thresholds, counts, eta):
-            return jax.vmap(partial(expand_counts, OrdinalProbit(thresholds, noise)))(eta, counts)
+    sensitivity = model.sensitivity
+
+    def each(some, likelihood):
+        def person(log_factor, counts, eta):
+            return jax.vmap(partial(expand_counts, with_factor(likelihood, log_factor, sensitivity)))(eta, counts)
 
         return jax.vmap(person)(*some)
 
-    return of_each_person(each, (model.person_thresholds, answers.counts, eta), model.noise)
+    return of_each_person(each, (model.log_widths, answers.counts, eta), model.likelihood)
 
 
 # --- the mode

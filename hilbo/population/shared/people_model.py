@@ -16,7 +16,8 @@ __all__ = ["PeopleModel"]
 
 class PeopleModel(eqx.Module):
     """Hyperparameters of the hierarchical model of M participants: kernel and its theta, prior variances of the shared
-    and of the individual functions, thresholds, noise, and log widths of each participant's middle categories.
+    and of the individual functions, thresholds, noise, and each participant's log factor in the
+    use of the scale (`scale_use`).
     """
 
     theta: Float[Array, "*d"]
@@ -28,13 +29,15 @@ class PeopleModel(eqx.Module):
     thresholds: Float[Array, " edges"]
     noise: Float[Array, ""]
     log_widths: Float[Array, " M"]
-    """Logarithm of each person's distances between thresholds, about their middle, in units of those above."""
+    """Logarithm of each person's factor, as `with_factor` takes it."""
     kernel: type[Stationary] = eqx.field(static=True, default=RBF)
     """Of g and of each h_j."""
     levels: tuple[int, ...] = eqx.field(static=True, default=())
     """For each coordinate its number of unordered levels, as kernels take it."""
     effect: Float[Array, ""] | None = None
     """Prior variance of what each context adds to everybody's function; None without a random effect."""
+    sensitivity: bool = eqx.field(static=True, default=False)
+    """Whether the factors are those of sensitivities about the highest threshold; otherwise of widths (`scale_use`)."""
 
     @classmethod
     def of(cls, gp: OrdinalGP, share: ArrayLike, people: int) -> "PeopleModel":
@@ -56,7 +59,12 @@ class PeopleModel(eqx.Module):
     @property
     def gp(self) -> OrdinalGP:
         """One participant's model, with the median distances between thresholds; without random effect."""
-        return OrdinalGP(self.of_variance(self.shared + self.own), OrdinalProbit(self.thresholds, self.noise))
+        return OrdinalGP(self.of_variance(self.shared + self.own), self.likelihood)
+
+    @property
+    def likelihood(self) -> OrdinalProbit:
+        """Likelihood of the median participant, whose factor is 1."""
+        return OrdinalProbit(self.thresholds, self.noise)
 
     @property
     def unit(self) -> Stationary:
@@ -66,9 +74,3 @@ class PeopleModel(eqx.Module):
     def of_variance(self, variance: Float[Array, ""]) -> Stationary:
         """The kernel with this variance, a scalar."""
         return self.kernel(self.theta, variance, self.levels)
-
-    @property
-    def person_thresholds(self) -> Float[Array, "M edges"]:
-        """Each participant's thresholds (M, C - 1): the common ones, with individual distances from their mean."""
-        middle = jnp.mean(self.thresholds)
-        return middle + jnp.exp(self.log_widths)[:, None] * (self.thresholds - middle)[None, :]

@@ -180,16 +180,30 @@ def _population(results):
             f" {100 * mean:.1f} %; individual optima are farther by {farther} on average"
             " (supports: an interval above 0, and their mean is farther too).",
         )
-    p = float(best.class_probabilities[-1])
-    yield Evidence(
-        _largest(np.asarray(best.class_probabilities), -1),
-        f'At the population optimum the map gives "{study.responses[-1]}" a probability of {100 * p:.0f} %'
-        " (supports: the likeliest answer).",
-    )
+    yield _likeliest(analysis)
     if results.validated is None:
         yield Evidence("inconclusive", "No validation session asked people again.")
         return
     yield from _validation(results.validated, study.responses)
+
+
+def _likeliest(analysis):
+    """Evidence whether a new participant's likeliest response at the optimum is the highest one, with all of its
+    probability's 95 % interval.
+    """
+    highest, top = analysis.population.highest, analysis.study.responses[-1]
+    if highest is None:
+        words = f"The rule {analysis.study.rule} does not predict a new one's answers."
+        return Evidence("inconclusive", words)
+    chances = np.asarray(analysis.aggregate.optimum.class_probabilities)
+    side = _largest(chances, -1)
+    if side == "supports" and highest.low <= np.delete(chances, -1).max():
+        side = "inconclusive"
+    return Evidence(
+        side,
+        f'At the population optimum a new participant answers "{top}" with a probability of {highest.probability:.0%}'
+        f" (95 % interval {highest.low:.0%} to {highest.high:.0%}; supports: more likely than any other answer).",
+    )
 
 
 def _validation(validated, responses):

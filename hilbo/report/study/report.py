@@ -220,6 +220,8 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "moved": content["optimised"]["nrmse"],
         "criterion": content["optimised"]["criterion"],
         "model_check": content["model_check"],
+        "chances": content["optimum"]["class_probabilities"],
+        "highest": content["highest_answer"],
         "without": [name for name, reading in readings if all(i is None for i, _ in reading.tolerances.values())],
         "comparison": content["comparison"] and comparison_section(analysis.study, content["comparison"]),
         "halves": analysis.progress.splits,

@@ -95,7 +95,8 @@ def alternatives_table(analysis: Analysis) -> pd.DataFrame:
     """All estimates that could be presented as the optimum, a row each: parameters, latent score (mean, sd),
     probability of the highest response, and with mechanics the passivity margin (N·s/m; negative is not passive).
 
-    Means of optima and sets have no score.
+    Means of optima and sets have no score. Methods with given hyperparameters do not predict a new participant's
+    response.
     """
     study, aggregate = analysis.study, analysis.aggregate
     claims: dict[str, tuple[Any, Any]] = {"population": (aggregate.optimum.x, aggregate.optimum)}
@@ -110,10 +111,9 @@ def alternatives_table(analysis: Analysis) -> pd.DataFrame:
     for name, (x, optimum) in claims.items():
         rendering = Rendering.at(study.space, x)
         row = {"optimum": name} | rendering.shown
-        row |= (
-            {}
-            if optimum is None
-            else {"mean": float(optimum.mean), "sd": float(optimum.sd), "p_top": float(optimum.class_probabilities[-1])}
-        )
+        if optimum is not None:
+            row |= {"mean": float(optimum.mean), "sd": float(optimum.sd)}
+            rule = RULES.get(name.removeprefix("population, "), RULES[study.rule])
+            row["p_top"] = float(optimum.class_probabilities[-1]) if rule.learns else None
         rows.append(row if study.space.mechanics is None else row | {"passivity_margin": rendering.margin})
     return pd.DataFrame(rows)

@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 from hilbo.errors import InputError
 from hilbo.population.rules.registry import RULES
+from hilbo.study.analysis.highest_answer import HighestAnswer, highest_answer
 from hilbo.study.analysis.model_check import model_check
 from hilbo.study.analysis.progress import Progress, follow
-from hilbo.study.analysis.region import Region, optimum_region
+from hilbo.study.analysis.region import Region, hyperparameter_draws, optimum_region
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, SayCount, aggregate_cohort, asked_variance
@@ -37,6 +38,9 @@ class CohortResults(NamedTuple):
     """Credible region of the optimum; None for a map without a joint posterior, or if not requested."""
     check: Content | None
     """Results of the model check (`model_check`); None if not requested, or with fewer than three participants."""
+    highest: HighestAnswer | None = None
+    """A new participant's probability of the highest response at the optimum; None by methods with given
+    hyperparameters."""
 
     @property
     def cohort(self) -> Cohort:
@@ -81,10 +85,13 @@ def analyse_cohort(
         study, cohort, seed, alternatives=whole, first=first, individuals=individuals, say=count
     )
     if not whole:
-        return CohortResults(study, aggregate, None, seed, None, None)
+        highest = highest_answer(study, aggregate.map, aggregate.optimum.x)
+        return CohortResults(study, aggregate, None, seed, None, None, highest)
     say("the optima after fewer trials")
     beside = ThreadPoolExecutor(1, "progress")
     following = beside.submit(follow, study, aggregate, seed)
     beside.shutdown(wait=False)
-    region = optimum_region(study, aggregate.map, cohort.trials, seed)
-    return CohortResults(study, aggregate, following, seed, region, model_check(study, aggregate))
+    drawn = hyperparameter_draws(study, cohort.trials, seed)
+    region = optimum_region(study, aggregate.map, drawn, seed)
+    highest = highest_answer(study, aggregate.map, aggregate.optimum.x, drawn)
+    return CohortResults(study, aggregate, following, seed, region, model_check(study, aggregate), highest)

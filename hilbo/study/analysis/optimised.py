@@ -34,7 +34,8 @@ __all__ = ["LEARNABLE", "FixedAndOptimised", "differentiable", "fixed_and_optimi
 LEARNABLE = ("theta", "noise", "thresholds")
 """Hyperparameters that are optimised. The prior variance is kept: it fixes the scale of the latent function."""
 _COORDINATES = {"shared": "shared variance", "own": "individual variance", "middle": "thresholds", "gaps": "thresholds"}
-_COORDINATES |= {"widths": "individual widths", "effect": "random effect"}
+_COORDINATES |= {"widths": "individual use of the scale", "effect": "random effect"}
+_COORDINATES |= {"sensitivity": "individual use of the scale"}
 
 
 class FixedAndOptimised(NamedTuple):
@@ -111,7 +112,7 @@ def _learnt(study: Study, cohort: Cohort) -> FixedAndOptimised:
     fixed = dataclasses.replace(study, gp=before.model.gp, learnt=before)
     learnt = optimised.learnt
     assert learnt is not None
-    comparable = learnt.people == len(cohort.names) and not learnt.widths
+    comparable = learnt.people == len(cohort.names) and learnt.scale is None
     return FixedAndOptimised(
         fixed=fixed,
         optimised=optimised,

@@ -5,6 +5,7 @@ were the maximum, until it contains 95 % of the draws. The points are spread eve
 included. Learnt hyperparameters are drawn too: fixed at their estimates, they would make the region too small.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from jaxtyping import Float, Int
 
 from hilbo.kernels import Stationary, embedded
 from hilbo.ordinal_gp import Trials
-from hilbo.population.learnt.rule import drawn_functions
+from hilbo.population.learnt.rule import DrawnMap, drawn_maps
 from hilbo.population.maps import RuleMap
 from hilbo.search.box import Parameter
 from hilbo.search.rendering import Rendering
@@ -22,7 +23,7 @@ from hilbo.study.config import Study
 from hilbo.study.estimate.best_places import DRAWS, POINTS, best_places
 from hilbo.study.estimate.optimum import predict_map
 
-__all__ = ["Region", "optimum_region", "region_content", "region_sentences"]
+__all__ = ["Region", "hyperparameter_draws", "optimum_region", "region_content", "region_sentences"]
 
 PROBABILITY = 0.95
 _LOCATED = 0.25  # of the feasible set: a larger region locates nothing
@@ -55,17 +56,24 @@ class Region(NamedTuple):
         return bool(near <= far)
 
 
-def optimum_region(study: Study, map_: RuleMap, trials: Trials, seed: int = 0, count: int = POINTS) -> Region | None:
+def hyperparameter_draws(study: Study, trials: Trials, seed: int = 0) -> list[DrawnMap]:
+    """Maps by drawn hyperparameters, of a study that has learnt them from stacked `trials`; otherwise none."""
+    if study.learnt is None:
+        return []
+    return drawn_maps(study.learnt, trials, study.stated, seed, _HYPERPARAMETERS)
+
+
+def optimum_region(
+    study: Study, map_: RuleMap, drawn: Sequence[DrawnMap] = (), seed: int = 0, count: int = POINTS
+) -> Region | None:
     """Credible region of the map's optimum; None for maps without a joint posterior (those aggregated point by point).
 
-    `trials`: the responses behind the map, stacked (M, ...). `count`: number of even points of the feasible set; a
-    quarter as many are added on its walls.
+    `drawn`: of `hyperparameter_draws`. `count`: number of even points of the feasible set; a quarter as many are added
+    on its walls.
     """
     if map_.shared is None:
         return None
-    functions = [map_.shared]
-    if study.learnt is not None:
-        functions = drawn_functions(study.learnt, trials, study.stated, seed, _HYPERPARAMETERS) or functions
+    functions = [each.function for each in drawn] or [map_.shared]
     places = best_places(study.space, functions, seed, count, _DRAWS)
     first, which = _distinct(np.asarray(places.points))
     points, weight = np.asarray(places.points)[first], np.bincount(which, np.asarray(places.share))

@@ -155,7 +155,7 @@ class Aggregate(eqx.Module):
 
     def class_probabilities(self, likelihood: OrdinalProbit, x: Float[ArrayLike, "m d"]) -> Float[Array, "m C"]:
         """Probabilities (m, C) of a new participant's responses at points of the unit cube."""
-        return class_probabilities(likelihood, *self.newcomer(x), self.map.widths)
+        return class_probabilities(likelihood, *self.newcomer(x), self.map.scale)
 
     @property
     def newcomer(self) -> Newcomer:

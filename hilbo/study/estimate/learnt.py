@@ -19,6 +19,7 @@ from hilbo.study.config import Study
 
 __all__ = ["by_rule", "effect_content", "learnt_content", "learnt_sentences", "resolved", "that_learns"]
 
+_LABELS = {"effect": "random effect", "sensitivity": "spread of sensitivities"}
 _UNKNOWN = 0.9  # of the prior's standard deviation: the answers hardly say more
 
 
@@ -55,9 +56,10 @@ def resolved(study: Study, cohort: Cohort) -> Study:
     return dataclasses.replace(study, gp=learnt.model.gp, learnt=learnt)
 
 
-def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
+def learnt_content(study: Study, names: Sequence[str], map_: RuleMap) -> dict[str, Any] | None:
     """Learnt hyperparameters as a dict for result.json: estimates, 95 % intervals, and the names of those that the data
-    do not identify. None if nothing was learnt. `names`: the participants'."""
+    do not identify. None if nothing was learnt. `names`: the participants'; `map_`: the map by these hyperparameters,
+    whose log evidence is of all responses, by more features than the search uses."""
     learnt = study.learnt
     if learnt is None:
         return None
@@ -71,19 +73,19 @@ def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
         "own_variance": float(model.own),
         "share": float(model.share),
         "thresholds": np.asarray(model.thresholds).tolist(),
-        "log_evidence": float(learnt.log_evidence),
+        "log_evidence": float(learnt.log_evidence if map_.shared is None else map_.shared.log_evidence),
         "steps": int(learnt.steps),
         "converged": bool(learnt.converged),
         "people": learnt.people,
     }
     content["intervals"] = {name: list(ends) for name, ends, _ in _coordinates(study, learnt)}
     content["not_identified"] = [name for name, _, known in _coordinates(study, learnt) if not known]
-    if learnt.widths:
-        widths, sd = (np.asarray(part["widths"]) for part in (learnt.coordinates, learnt.sd))
-        ends = np.exp(np.stack([widths, widths - 1.96 * sd, widths + 1.96 * sd], axis=1)).tolist()
-        content["widths"] = {
-            name: {"width": width, "interval": [low, high]}
-            for name, (width, low, high) in zip(names, ends, strict=True)
+    if learnt.scale is not None:
+        kind, sign = ("sensitivity", -1) if learnt.scale.sensitivity else ("width", 1)
+        logs, sd = sign * np.asarray(learnt.coordinates["widths"]), np.asarray(learnt.sd["widths"])
+        ends = np.exp(np.stack([logs, logs - 1.96 * sd, logs + 1.96 * sd], axis=1)).tolist()
+        content["sensitivities" if learnt.scale.sensitivity else "widths"] = {
+            name: {kind: value, "interval": [low, high]} for name, (value, low, high) in zip(names, ends, strict=True)
         }
     return content
 
@@ -116,7 +118,7 @@ def _coordinates(study: Study, learnt: Learnt) -> list[tuple[str, tuple[float, f
         means, sds = np.atleast_1d(np.asarray(value)), np.atleast_1d(np.asarray(learnt.sd[name]))
         labels = [f"theta.{p}" for p in study.space.names] if name == "theta" else [name]
         labels = [f"gap {i + 1}" for i in range(len(means))] if name == "gaps" else labels
-        labels = ["random effect"] if name == "effect" else labels
+        labels = [_LABELS[name]] if name in _LABELS else labels
         for label, mean, sd in zip(labels, means.tolist(), sds.tolist(), strict=True):
             ends = mean - 1.96 * sd, mean + 1.96 * sd
             ends = ends if name == "middle" else (math.exp(ends[0]), math.exp(ends[1]))

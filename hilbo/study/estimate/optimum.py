@@ -25,6 +25,7 @@ from hilbo.population import pointwise
 from hilbo.population.maps import RuleMap
 from hilbo.population.newcomer import class_probabilities, log_highest
 from hilbo.population.rules.registry import RULES
+from hilbo.population.shared.scale_use import ScaleUse
 from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
 from hilbo.study.estimate.best_places import best_places, nearness
@@ -154,7 +155,7 @@ def _map_optimum(
         map_.apart,
         lambda x: log_chance(*map_.predict(x[None, :]))[0],
         lambda x: map_.predict(x[None, :])[1][0] <= surest,
-        map_.widths,
+        map_.scale,
     )
 
 
@@ -185,14 +186,14 @@ def _centre(
         return (variance[0] <= surest) & (jnp.exp(_log_chance(likelihood, map_, mean, variance)[0]) >= least)
 
     values = jax.vmap(near)(candidates)
-    return _optimum(likelihood, space, map_.predict, candidates, values, map_.apart, near, allowed, map_.widths)
+    return _optimum(likelihood, space, map_.predict, candidates, values, map_.apart, near, allowed, map_.scale)
 
 
 def _log_chance(
     likelihood: OrdinalProbit, map_: RuleMap, mean: Float[Array, " m"], variance: Float[Array, " m"]
 ) -> Float[Array, " m"]:
     """Log probability (m,) of a new participant's highest response, from the map's mean and variance."""
-    return log_highest(likelihood, mean, variance + map_.apart, map_.widths)
+    return log_highest(likelihood, mean, variance + map_.apart, map_.scale)
 
 
 def _reach(map_: RuleMap, variances: Float[Array, " m"]) -> Float[Array, ""]:
@@ -211,13 +212,13 @@ def _optimum(
     apart: ArrayLike,
     score: Callable[[Float[Array, " d"]], Float[Array, ""]] | None = None,
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
-    widths: bool = False,
+    scale: ScaleUse | None = None,
 ) -> Optimum:
     """Maximise a score over the feasible set, and evaluate the map at the maximum.
 
     `predict`: points (m, d) -> mean and variance (m,). `values`: score of each candidate. `apart`: variance of an
     individual's function around the map, added for the class probabilities. `score`: score of one point, by default the
-    mean. `allowed`: constraint on one point. `widths`: whether participants differ in their widths of categories.
+    mean. `allowed`: constraint on one point. `scale`: how participants differ in the use of the scale.
     """
     choice = acquisition.maximise(
         values,
@@ -228,7 +229,7 @@ def _optimum(
         steps=300,
     )
     mean, variance = predict(choice.x[None, :])
-    probabilities = class_probabilities(likelihood, mean, variance + apart, widths)[0]
+    probabilities = class_probabilities(likelihood, mean, variance + apart, scale)[0]
     return Optimum(choice.x, mean[0], jnp.sqrt(variance[0]), probabilities)
 
 

@@ -1,0 +1,78 @@
+"""Probability that a new participant gives the highest response at a stimulus, with its uncertainty."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+from scipy.stats import norm
+
+from hilbo.likelihoods import OrdinalProbit
+from hilbo.population.learnt.rule import DrawnMap
+from hilbo.population.maps import RuleMap
+from hilbo.population.newcomer import log_highest
+from hilbo.population.rules.registry import RULES
+from hilbo.population.shared.scale_use import ScaleUse
+from hilbo.study.config import Study
+
+__all__ = ["HighestAnswer", "highest_answer"]
+
+_QUANTILES = norm.ppf((np.arange(1000) + 0.5) / 1000)  # of the shared function at the stimulus, in each draw
+
+
+class HighestAnswer(NamedTuple):
+    """Probability of the highest response, and the ends of its 95 % credible interval."""
+
+    probability: float
+    low: float
+    high: float
+
+
+def highest_answer(
+    study: Study, map_: RuleMap, x: Float[ArrayLike, " d"], drawn: Sequence[DrawnMap] = ()
+) -> HighestAnswer | None:
+    """Probability that a new participant gives the highest response at a point `x` (d,) of the unit cube.
+
+    The interval is of what is not known of the shared function there and, through `drawn`, of the hyperparameters; that
+    participants differ is part of the probability itself. None for methods with given hyperparameters: what
+    these say is off by .3 on average (docs/methods/aggregation.md).
+    """
+    if not RULES[map_.rule].learns:
+        return None
+    point = jnp.asarray(x)[None, :]
+    of_map = study.gp.likelihood, *map_.predict(point), map_.apart, map_.scale
+    mean, variance, apart = (float(jnp.squeeze(value)) for value in of_map[1:4])
+    probability = _chances(of_map[0], np.array([mean]), apart + variance, map_.scale)[0]
+    draws = [_drawn(each, point) for each in drawn] or [of_map]
+    chances = np.concatenate([_over_the_function(*each) for each in draws])
+    low, high = np.quantile(chances, [0.025, 0.975])
+    return HighestAnswer(float(probability), float(low), float(high))
+
+
+def _drawn(drawn: DrawnMap, point: Float[Array, "1 d"]) -> tuple:
+    """Arguments of `_over_the_function` for drawn hyperparameters."""
+    model = drawn.model
+    apart = model.own if model.effect is None else model.own + model.effect
+    return model.likelihood, *drawn.function.predict(point), apart, drawn.scale
+
+
+def _over_the_function(
+    likelihood: OrdinalProbit,
+    mean: Float[Array, " 1"],
+    variance: Float[Array, " 1"],
+    apart: Float[Array, ""],
+    scale: ScaleUse | None,
+) -> Float[np.ndarray, " 1000"]:
+    """Probability of the highest response at even quantiles of the shared function; `apart`: variance of participants'
+    functions about it."""
+    functions = float(mean[0]) + np.sqrt(float(variance[0])) * _QUANTILES
+    return _chances(likelihood, functions, float(apart), scale)
+
+
+def _chances(
+    likelihood: OrdinalProbit, mean: Float[np.ndarray, " m"], variance: float, scale: ScaleUse | None
+) -> Float[np.ndarray, " m"]:
+    """Probabilities (m,) of the highest response for participants' functions of this mean and variance."""
+    return np.exp(np.asarray(log_highest(likelihood, jnp.asarray(mean), jnp.full(len(mean), variance), scale)))
