@@ -29,7 +29,7 @@ from hilbo.population.maps import learnt_map, rule_map  # noqa: E402
 from hilbo.population.rules.registry import RULES  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
-from hilbo.study.analysis.highest_answer import highest_answer  # noqa: E402
+from hilbo.study.analysis.highest_answer import with_interval  # noqa: E402
 from hilbo.study.analysis.region import hyperparameter_draws  # noqa: E402
 from hilbo.study.estimate.learnt import resolved, that_learns  # noqa: E402
 from hilbo.study.estimate.optimum import map_optimum  # noqa: E402
@@ -91,8 +91,9 @@ def by_rule(study, cohort, rule, candidates, chance, best, places, seed):
 
     true = float(chance_at(chance, optimum[None, :])[0])
     row = {"regret": best - true, "promise": float(said(optimum[None, :])[0]), "true": true}
-    highest = highest_answer(study, map_, optimum, hyperparameter_draws(study, cohort.trials, seed))
-    if highest is not None:
+    if RULES[rule].learns:
+        drawn = hyperparameter_draws(study, cohort.trials, seed)
+        highest = with_interval(study.gp.likelihood, map_, optimum, drawn)
         row |= {"low": highest.low, "high": highest.high}
     for where, x in zip(("tested", "untested"), places, strict=True):
         gap = said(x) - np.asarray(chance_at(chance, x))
@@ -128,7 +129,7 @@ def cells(said, others):
     bias = [each["promise"] - each["true"] for each in said]
     yield f"{mean_and_error(bias)}"
     held = [each["low"] <= each["true"] <= each["high"] for each in said if "low" in each]
-    yield f"{np.mean(held):.0%} hold it" if held and "sd" in said[0] else "–"
+    yield f"{np.mean(held):.0%} hold it" if len(held) == len(said) else "–"
     yield " ".join(f"{np.mean([each[f'{where} bias'] for each in said]):+.3f}" for where in ("tested", "untested"))
     regret = np.array([each["regret"] for each in said])
     yield mean_and_error(regret, sign="")

@@ -112,6 +112,7 @@ def _environment() -> Environment:
     }
     environment.globals |= {"heads": heads, "zip": zip, "estimate_words": estimate_words}
     environment.globals |= {"covariance_words": covariance_words, "formula": formula, "recommended": RECOMMENDED}
+    environment.globals["predicting"] = next(rule.name for rule in RULES.values() if rule.predicts)
     return environment
 
 

@@ -67,6 +67,7 @@ def robustness_page(study: Study, content: Content, figures: Pictures) -> str:
         near=NEAR,
         top=study.responses[-1],
         learns=RULES[study.rule].learns,
+        predicts=RULES[study.rule].predicts,
         sensitivity={name: np.atleast_2d(np.asarray(block).T) for name, block in blocks.items()},
         how=content["aggregated"],
         table=None if study.gp.kernel.levels else _table(content["learned"]),

@@ -62,5 +62,6 @@ def test_drawn_hyperparameters_widen_it(function):
     assert drawn.low == pytest.approx(plain_.low, abs=0.05)
 
 
-def test_methods_with_given_hyperparameters_do_not_say_it(function):
-    assert highest_answer(STUDY, map_of(function, None, "pooled"), X) is None
+@pytest.mark.parametrize("rule", ["pooled", "learnt-2"])
+def test_methods_that_do_not_predict_it_do_not_say_it(function, rule):
+    assert highest_answer(STUDY, map_of(function, None, rule), X) is None

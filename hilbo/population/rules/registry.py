@@ -44,6 +44,9 @@ class Rule:
     """and nothing stands in for it where they are too many."""
     recipe: Recipe | None = None
     """Of a rule that learns the hyperparameters; others take them from [gp]."""
+    predicts: bool = False
+    """Whether pages print its probability of a new participant's highest response: in simulated populations it is near
+    to what happens, and its 95 % intervals contain that about as often as they should."""
     centred: bool = False
     """Whether the optimum is the place that the best rendering is most often near (`study.best_places.nearness`), of
     those where a new person gives the highest answer at most 0.05 less often than anywhere."""
@@ -138,6 +141,7 @@ _ALL: Final = (
         pointwise="hierarchical",
         joint=True,
         recipe=LEARNT_3,
+        predicts=True,
         centred=True,
     ),
 )

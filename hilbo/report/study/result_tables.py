@@ -95,8 +95,8 @@ def alternatives_table(analysis: Analysis) -> pd.DataFrame:
     """All estimates that could be presented as the optimum, a row each: parameters, latent score (mean, sd),
     probability of the highest response, and with mechanics the passivity margin (N·s/m; negative is not passive).
 
-    Means of optima and sets have no score. Methods with given hyperparameters do not predict a new participant's
-    response.
+    Means of optima and sets have no score. Only methods that predict a new participant (`Rule.predicts`) have the
+    probability.
     """
     study, aggregate = analysis.study, analysis.aggregate
     claims: dict[str, tuple[Any, Any]] = {"population": (aggregate.optimum.x, aggregate.optimum)}
@@ -114,6 +114,6 @@ def alternatives_table(analysis: Analysis) -> pd.DataFrame:
         if optimum is not None:
             row |= {"mean": float(optimum.mean), "sd": float(optimum.sd)}
             rule = RULES.get(name.removeprefix("population, "), RULES[study.rule])
-            row["p_top"] = float(optimum.class_probabilities[-1]) if rule.learns else None
+            row["p_top"] = float(optimum.class_probabilities[-1]) if rule.predicts else None
         rows.append(row if study.space.mechanics is None else row | {"passivity_margin": rendering.margin})
     return pd.DataFrame(rows)

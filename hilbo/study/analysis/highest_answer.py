@@ -17,7 +17,7 @@ from hilbo.population.rules.registry import RULES
 from hilbo.population.shared.scale_use import ScaleUse
 from hilbo.study.config import Study
 
-__all__ = ["HighestAnswer", "highest_answer"]
+__all__ = ["HighestAnswer", "highest_answer", "with_interval"]
 
 _QUANTILES = norm.ppf((np.arange(1000) + 0.5) / 1000)  # of the shared function at the stimulus, in each draw
 
@@ -36,13 +36,20 @@ def highest_answer(
     """Probability that a new participant gives the highest response at a point `x` (d,) of the unit cube.
 
     The interval is of what is not known of the shared function there and, through `drawn`, of the hyperparameters; that
-    participants differ is part of the probability itself. None for methods with given hyperparameters: what
-    these say is off by .3 on average (docs/methods/aggregation.md).
+    participants differ is part of the probability itself. None for methods that do not predict a new
+    participant (`Rule.predicts`).
     """
-    if not RULES[map_.rule].learns:
+    if not RULES[map_.rule].predicts:
         return None
+    return with_interval(study.gp.likelihood, map_, x, drawn)
+
+
+def with_interval(
+    likelihood: OrdinalProbit, map_: RuleMap, x: Float[ArrayLike, " d"], drawn: Sequence[DrawnMap] = ()
+) -> HighestAnswer:
+    """As `highest_answer`, of any map; `likelihood`: the median participant's."""
     point = jnp.asarray(x)[None, :]
-    of_map = study.gp.likelihood, *map_.predict(point), map_.apart, map_.scale
+    of_map = likelihood, *map_.predict(point), map_.apart, map_.scale
     mean, variance, apart = (float(jnp.squeeze(value)) for value in of_map[1:4])
     probability = _chances(of_map[0], np.array([mean]), apart + variance, map_.scale)[0]
     draws = [_drawn(each, point) for each in drawn] or [of_map]
