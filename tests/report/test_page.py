@@ -1,6 +1,7 @@
 """Pages: a number that a template misses is an error, and what a page says of the same numbers told differently."""
 
 import re
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from jinja2 import UndefinedError
 from studies import plain_study
 
+import hilbo
 from hilbo.report.page import _environment, rendered
 from hilbo.report.robustness import robustness_page
 from hilbo.report.study import report as study_report
@@ -155,3 +157,10 @@ def test_a_sentence_in_a_table_wraps_and_a_number_does_not():
         _environment().get_template("parts.html").module.row(["hierarchical", "4.07", "an extrapolation: " + "x " * 20])
     )
     assert row.count("<td") == 2 and row.count('<td class="n">') == 1 and '<td class="n">4.07' in row
+
+
+def test_no_two_macros_have_one_name():
+    """The second would stand in for the first, with other arguments."""
+    source = (Path(hilbo.__file__).parent / "report" / "templates" / "parts.html").read_text(encoding="utf-8")
+    names = re.findall(r"{% macro (\w+)\(", source)
+    assert len(names) > 10 and len(names) == len(set(names))
