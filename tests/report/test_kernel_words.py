@@ -41,6 +41,7 @@ def test_every_kernel_of_a_rule_has_words():
     assert {name: covariance_words(KERNELS[recipe.kernel](1.0)) for name, recipe in RECIPES.items()} == {
         "learnt-1": "squared-exponential",
         "learnt-2": "Matérn 3/2",
+        "learnt-3": "Matérn 3/2",
     }
 
 

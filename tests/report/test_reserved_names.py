@@ -145,4 +145,4 @@ def test_a_parameter_called_f_keeps_its_values():
     study = called("f")
     table = alternatives(study)
     assert table["f"].tolist() == [0.5] * 4 and table["mean"].iloc[0] == 0.75 and study.space.names == ("f", "v")
-    assert _alternatives(study, table)["head"] == ["", "f", "v", "latent score", "sd", 'P("close")']
+    assert _alternatives(study, table)["head"] == ["", "f", "v", "latent score", "sd"]
