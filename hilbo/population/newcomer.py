@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.population.shared.scale_use import WEIGHTS, ScaleUse
+from hilbo.population.shared.scale_use import ScaleUse
 
 __all__ = ["InTurn", "class_probabilities", "in_turn", "log_highest", "predicted_in_turn", "with_variances"]
 
@@ -24,8 +24,8 @@ def class_probabilities(
     """Probabilities (m, C) of a new participant's responses, from mean and variance (m,) of that participant's
     function.
 
-    **Arguments:** `scale`: how participants differ in the use of the scale, which is integrated out by Gauss-Hermite
-    quadrature with 7 nodes; None if they do not.
+    **Arguments:** `scale`: how participants differ in the use of the scale, which is integrated out by its
+    quadrature; None if they do not.
     """
     if scale is None:
         return jax.vmap(likelihood.class_probabilities)(mean, variance)
@@ -33,7 +33,7 @@ def class_probabilities(
     def given(log_factor: Float[Array, ""]) -> Float[Array, "m C"]:
         return jax.vmap(scale.of_person(likelihood, log_factor).class_probabilities)(mean, variance)
 
-    return jnp.tensordot(jnp.asarray(WEIGHTS, mean.dtype), jax.vmap(given)(scale.log_factors), 1)
+    return jnp.tensordot(scale.weights, jax.vmap(given)(scale.log_factors), 1)
 
 
 def log_highest(
@@ -50,7 +50,7 @@ def log_highest(
     if scale is None:
         return given(likelihood)
     each = jax.vmap(lambda w: given(scale.of_person(likelihood, w)))(scale.log_factors)
-    return logsumexp(each, axis=0, b=jnp.asarray(WEIGHTS, mean.dtype)[:, None])
+    return logsumexp(each, axis=0, b=scale.weights[:, None])
 
 
 def with_variances(covariance: Float[Array, "m m"], variance: Float[Array, " m"]) -> Float[Array, "m m"]:
@@ -97,7 +97,7 @@ def predicted_in_turn(
         return in_turn(likelihood, mean, covariance, q, mask)
     people = jax.vmap(lambda w: scale.of_person(likelihood, w))(scale.log_factors)
     each = jax.vmap(lambda person: in_turn(person, mean, covariance, q, mask))(people)
-    weights = jnp.log(jnp.asarray(WEIGHTS, mean.dtype))
+    weights = jnp.log(scale.weights)
     logs = jnp.cumsum(jnp.where(mask, each.log_given, 0.0), axis=1)
     before = weights[:, None] + jnp.pad(logs[:, :-1], ((0, 0), (1, 0)))
     share = jax.nn.log_softmax(before, axis=0)

@@ -11,10 +11,11 @@ from attacks.support import run
 pytestmark = [pytest.mark.deep, needs_device, pytest.mark.skipif(sys.platform != "linux", reason="/proc")]
 
 
-def test_kills_lose_double_and_change_nothing(tmp_path):
+@pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.release)])
+def test_kills_lose_double_and_change_nothing(tmp_path, count):
     kills = Kills(tmp_path, trials=15)
     try:
-        counts = run(kills, 5, 1)
+        counts = run(kills, count, 1)
     finally:
         kills.close()
-    assert sum(counts.values()) == 5 and not [word for word in counts if word.startswith("THROUGH")], counts
+    assert sum(counts.values()) == count and not [word for word in counts if word.startswith("THROUGH")], counts

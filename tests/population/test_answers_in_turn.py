@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal, norm
 from hilbo import RBF, OrdinalProbit
 from hilbo.kernels import gram
 from hilbo.population import newcomer
-from hilbo.population.shared.scale_use import WEIGHTS, ScaleUse
+from hilbo.population.shared.scale_use import ScaleUse
 
 LIKELIHOOD = OrdinalProbit(jnp.array([-0.5, 0.8]), jnp.asarray(0.7))
 WIDTHS, SENSITIVITY = ScaleUse(jnp.asarray(0.4)), ScaleUse(jnp.asarray(0.5), True)
@@ -50,7 +50,7 @@ def test_answers_are_predicted_from_those_before(scale):
         predicted_in_turn(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(covariance), jnp.asarray(Q), ALL, scale),
     )
     people = [LIKELIHOOD] if scale is None else [scale.of_person(LIKELIHOOD, w) for w in scale.log_factors]
-    weights = [1.0] if scale is None else WEIGHTS
+    weights = [1.0] if scale is None else scale.weights
     joint = sum(w * boxes(person, mean, covariance) for w, person in zip(weights, people, strict=True))
     np.testing.assert_allclose(predicted, joint / joint.sum(axis=1, keepdims=True), atol=0.02)
     alone = np.asarray(class_probabilities(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(np.diagonal(covariance)), scale))

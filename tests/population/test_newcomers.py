@@ -125,7 +125,7 @@ def test_readings_are_of_new_people(monkeypatch):
         newcomer=lambda x: (jnp.zeros(len(x)), jnp.full(len(x), 3.0)),
     )
     aggregate.class_probabilities = partial(Aggregate.class_probabilities, aggregate)
-    monkeypatch.setattr(analysis, "tolerance", lambda study, predict, x, name: predict)
+    monkeypatch.setattr(analysis, "tolerance", lambda study, predict, x, name, scale: predict)
     monkeypatch.setattr(analysis, "tolerance_ends", lambda *args, **named: None)
     read = analysis._reading(STUDY, aggregate, 0)
     assert all(tolerance[0] is aggregate.newcomer for tolerance in read.tolerances.values())
@@ -150,10 +150,11 @@ class_probabilities, log_highest = map(eqx.filter_jit, (newcomer.class_probabili
 
 
 WIDTHS, SENSITIVITY = ScaleUse(jnp.asarray(0.4)), ScaleUse(jnp.asarray(0.4), True)
+WIDE = ScaleUse(jnp.asarray(0.8), True)
 
 
-def by_quadrature(mean, variance, category, pivot):
-    """Over the log factor, N(0, 0.4^2): of the widths, or of a function that is divided by it about the pivot."""
+def by_quadrature(mean, variance, category, pivot, sd):
+    """Over the log factor, N(0, sd^2): of the widths, or of a function that is divided by it about the pivot."""
     edges = np.array([-np.inf, -0.5, 0.2, 1.3, np.inf])
 
     def given(w):
@@ -162,16 +163,16 @@ def by_quadrature(mean, variance, category, pivot):
         else:
             ends, at, variance_at = edges, pivot + (mean - pivot) / np.exp(w), variance / np.exp(2 * w)
         low, high = (ends[category : category + 2] - at) / np.sqrt(0.8**2 + variance_at)
-        return (norm.cdf(high) - norm.cdf(low)) * norm.pdf(w, 0.0, 0.4)
+        return (norm.cdf(high) - norm.cdf(low)) * norm.pdf(w, 0.0, sd)
 
-    return quad(given, -4.0, 4.0, epsabs=1e-12)[0]
+    return quad(given, -9 * sd, 9 * sd, epsabs=1e-12)[0]
 
 
-@pytest.mark.parametrize(("scale", "pivot"), [(WIDTHS, None), (SENSITIVITY, 1.3)])
+@pytest.mark.parametrize(("scale", "pivot"), [(WIDTHS, None), (SENSITIVITY, 1.3), (WIDE, 1.3)])
 def test_the_use_of_the_scale_is_integrated_out(scale, pivot):
     pairs = zip(*map(np.asarray, (MEAN, VARIANCE)), strict=True)
-    expected = [[by_quadrature(*pair, c, pivot) for c in range(4)] for pair in pairs]
-    np.testing.assert_allclose(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, scale), expected, atol=3e-4)
+    expected = [[by_quadrature(*pair, c, pivot, float(scale.sd)) for c in range(4)] for pair in pairs]
+    np.testing.assert_allclose(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, scale), expected, atol=2e-5)
 
 
 @pytest.mark.parametrize("scale", [None, WIDTHS, SENSITIVITY])

@@ -15,6 +15,7 @@ from hilbo.population.maps import RuleMap
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.scale_use import ScaleUse
 from hilbo.study.analysis.highest_answer import highest_answer
+from hilbo.study.analysis.tolerance import dominant
 
 GP = OrdinalGP(RBF(6.0, 3.0), OrdinalProbit((-0.5, 0.5), 0.5))
 SHARE, PRIOR = jnp.asarray(0.6), jnp.asarray(5.0)
@@ -65,3 +66,14 @@ def test_drawn_hyperparameters_widen_it(function):
 @pytest.mark.parametrize("rule", ["pooled", "learnt-2"])
 def test_methods_that_do_not_predict_it_do_not_say_it(function, rule):
     assert highest_answer(STUDY, map_of(function, None, rule), X) is None
+
+
+def test_tolerances_are_read_where_a_new_participant_s_likeliest_response_is_the_highest(function):
+    """With sensitivities, which change the other responses' probabilities: as the figure of the classes has it."""
+    scale = ScaleUse(jnp.asarray(0.8), sensitivity=True)
+    map_ = map_of(function, scale)
+    x = jnp.asarray(np.random.default_rng(1).uniform(size=(400, 2)))
+    chances = np.asarray(map_.class_probabilities(GP.likelihood, x))
+    leads = np.asarray(dominant(STUDY, map_.newcomer, x, scale))
+    np.testing.assert_array_equal(leads, chances[:, -1] > chances[:, :-1].max(axis=1))
+    assert np.any(leads != np.asarray(dominant(STUDY, map_.newcomer, x)))

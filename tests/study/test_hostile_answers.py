@@ -1,4 +1,4 @@
-"""learnt-1 and learnt-2 on answers that say little or contradict each other: what cannot be known is said."""
+"""learnt-1, learnt-2 and learnt-3 on answers that say little or contradict each other: what cannot be known is said."""
 
 import tomllib
 
@@ -38,7 +38,10 @@ def likes_one_place(x, rng):
     return (felt < 0.5).astype(int) + (felt < 0.25)
 
 
-@pytest.fixture(params=["learnt-1", pytest.param("learnt-2", marks=pytest.mark.release)])
+BEFORE_A_RELEASE = [pytest.param(rule, marks=pytest.mark.release) for rule in ("learnt-2", "learnt-3")]
+
+
+@pytest.fixture(params=["learnt-1", *BEFORE_A_RELEASE])
 def rule(request):
     return request.param
 
@@ -82,7 +85,7 @@ def test_one_trial_each(said, rule):
     rng = np.random.default_rng(2)
     content, words = said(cohort([person(rng, likes_one_place, 1) for _ in range(PEOPLE)]))
     assert NOWHERE in words
-    tone = {"theta.tone"} if rule == "learnt-1" else set()  # learnt-2's wider prior gives way even to six answers
+    tone = {"theta.tone"} if rule == "learnt-1" else set()  # the others' wider prior gives way even to six answers
     assert {"theta.level", "own"} | tone <= set(content["learnt"]["not_identified"])
 
 

@@ -23,7 +23,7 @@ FINE = 1e-3
 
 class Chosen(NamedTuple):
     """The search that is used, its problem, the coordinates that were free in it, and the gain of log evidence by
-    individual widths.
+    individual factors.
     """
 
     search: Search

@@ -206,7 +206,7 @@ def not_learnt(trials: Trials, categories: int, stated: Stated = NOTHING, recipe
     return _recorded(Chosen(search, problem, frozenset(), 0.0), {}, nothing, recipe)
 
 
-def _recorded(chosen: "Chosen", sd: Coordinates, covariance: Float[Array, "k k"], recipe: Recipe) -> Learnt:
+def _recorded(chosen: Chosen, sd: Coordinates, covariance: Float[Array, "k k"], recipe: Recipe) -> Learnt:
     """Result of a search, with the standard deviations and the covariance of its coordinates."""
     search, problem, free, gain = chosen
     answers = problem.answers

@@ -193,7 +193,7 @@ def _likeliest(analysis):
     """
     highest, top = analysis.population.highest, analysis.study.responses[-1]
     if highest is None:
-        words = f"The rule {analysis.study.rule} does not predict a new one's answers."
+        words = f"The rule {analysis.study.rule} does not predict a new participant's answers."
         return Evidence("inconclusive", words)
     chances = np.asarray(analysis.aggregate.optimum.class_probabilities)
     side = _largest(chances, -1)

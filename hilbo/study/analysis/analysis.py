@@ -185,15 +185,15 @@ def _aggregates(both: FixedAndOptimised, own: Aggregate, seed: int) -> tuple[Agg
 
 def _reading(study: Study, aggregate: Any, seed: int) -> Reading:
     """Tolerance intervals through the map's optimum, with their bootstrap, for every parameter without levels."""
-    x = aggregate.optimum.x
+    x, scale = aggregate.optimum.x, aggregate.map.scale
     rule, share = point_rule(study.rule, aggregate.map.share)
     return Reading(
         study,
         aggregate,
         {
             name: (
-                tolerance(study, aggregate.newcomer, x, name),
-                tolerance_ends(study, aggregate.posteriors, x, name, seed, rule=rule, share=share),
+                tolerance(study, aggregate.newcomer, x, name, scale),
+                tolerance_ends(study, aggregate.posteriors, x, name, seed, rule=rule, share=share, scale=scale),
             )
             for name in (p.name for p in study.space.parameters if not p.levels)
         },

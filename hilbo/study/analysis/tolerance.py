@@ -28,6 +28,8 @@ from hilbo import acquisition
 from hilbo.errors import InputError
 from hilbo.numerics.climbing import Choice
 from hilbo.numerics.tracing import program
+from hilbo.population.newcomer import class_probabilities
+from hilbo.population.shared.scale_use import ScaleUse
 from hilbo.search.apart import differences
 from hilbo.search.space import Bound
 from hilbo.study.config import Study
@@ -107,9 +109,12 @@ def best_mid_worst(
     return Sets(x, *_mean_and_sd(predict, x))
 
 
-def dominant(study: Study, predict: Predict, x: Float[Array, "m d"]) -> Bool[Array, " m"]:
-    """Whether the highest response is the most probable one at points (m, d) (paper, section VII-C)."""
-    return _lead(study, predict, x) > 0
+def dominant(
+    study: Study, predict: Predict, x: Float[Array, "m d"], scale: ScaleUse | None = None
+) -> Bool[Array, " m"]:
+    """Whether the highest response is the most probable one at points (m, d) (paper, section VII-C). `scale`: how
+    participants differ in the use of the scale."""
+    return _lead(study, predict, x, scale) > 0
 
 
 def slice_through(
@@ -127,13 +132,15 @@ def slice_through(
     return points, space.feasible(points)
 
 
-def tolerance(study: Study, predict: Predict, x: Float[Array, " d"], parameter: str) -> Tolerance | None:
+def tolerance(
+    study: Study, predict: Predict, x: Float[Array, " d"], parameter: str, scale: ScaleUse | None = None
+) -> Tolerance | None:
     """Tolerance interval of a parameter through the optimum `x` (d,); None if the highest response is not the most
-    probable one there."""
+    probable one there. `scale`: how participants differ in the use of the scale."""
     index = study.space.names.index(parameter)
     here, searched = float(x[index]), study.space.parameters[index]
     grid = searched.axis(_GRID) if searched.discrete else np.unique(np.append(np.linspace(0.0, 1.0, _GRID), here))
-    inside = _tolerated(study, predict, x, parameter, jnp.asarray(grid, x.dtype))
+    inside = _tolerated(study, predict, x, parameter, jnp.asarray(grid, x.dtype), scale)
     middle = int(np.argmin(np.abs(grid - here)))
     if not inside[middle]:
         return None
@@ -148,7 +155,7 @@ def tolerance(study: Study, predict: Predict, x: Float[Array, " d"], parameter: 
             continue
         inner, outer = grid[last], grid[beyond]
         if not searched.discrete:
-            inner, outer = _bisect(study, predict, x, parameter, inner, outer)
+            inner, outer = _bisect(study, predict, x, parameter, inner, outer, scale)
         ends.append((inner, _end(study, x, parameter, outer)))
     to_physical = searched.to_physical
     (low, low_end), (high, high_end) = ((float(to_physical(jnp.asarray(end))), kind) for end, kind in ends)
@@ -162,22 +169,33 @@ def _end(study: Study, x: Float[Array, " d"], parameter: str, outer: float) -> E
 
 
 def _tolerated(
-    study: Study, predict: Predict, x: Float[Array, " d"], parameter: str, values: Float[Array, " m"]
+    study: Study,
+    predict: Predict,
+    x: Float[Array, " d"],
+    parameter: str,
+    values: Float[Array, " m"],
+    scale: ScaleUse | None,
 ) -> Bool[np.ndarray, " m"]:
     """Mask of the parameter values (unit scale) at which the slice is feasible and the highest response is the most
     probable."""
     points, feasible = slice_through(study, x, parameter, values)
-    return np.asarray(feasible & dominant(study, predict, points))
+    return np.asarray(feasible & dominant(study, predict, points, scale))
 
 
 def _bisect(
-    study: Study, predict: Predict, x: Float[Array, " d"], parameter: str, inner: float, outer: float
+    study: Study,
+    predict: Predict,
+    x: Float[Array, " d"],
+    parameter: str,
+    inner: float,
+    outer: float,
+    scale: ScaleUse | None,
 ) -> tuple[float, float]:
     """Narrow down an interval's end between a value inside and one outside, by 40 bisections; returns both, inside
     first."""
     for _ in range(_HALVINGS):
         middle = (inner + outer) / 2
-        if _tolerated(study, predict, x, parameter, jnp.asarray([middle], x.dtype))[0]:
+        if _tolerated(study, predict, x, parameter, jnp.asarray([middle], x.dtype), scale)[0]:
             inner = middle
         else:
             outer = middle
@@ -185,9 +203,9 @@ def _bisect(
 
 
 @program
-def _lead(study: Study, predict: Predict, x: Float[Array, "m d"]) -> Float[Array, " m"]:
+def _lead(study: Study, predict: Predict, x: Float[Array, "m d"], scale: ScaleUse | None) -> Float[Array, " m"]:
     """Probability of the highest response minus that of the most probable other one. (m,)."""
-    p = jax.vmap(study.gp.likelihood.class_probabilities)(*predict(x))
+    p = class_probabilities(study.gp.likelihood, *predict(x), scale)
     return p[:, -1] - jnp.max(p[:, :-1], axis=1)
 
 

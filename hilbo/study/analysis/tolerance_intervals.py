@@ -18,7 +18,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
+from hilbo.population.newcomer import class_probabilities
 from hilbo.population.pointwise import aggregate
+from hilbo.population.shared.scale_use import ScaleUse
 from hilbo.study.analysis.bootstrap import can_resample
 from hilbo.study.analysis.tolerance import slice_through
 from hilbo.study.config import Study
@@ -47,13 +49,14 @@ def tolerance_ends(
     *,
     rule: str = "bcm",
     share: ArrayLike | None = None,
+    scale: ScaleUse | None = None,
     draws: int = _DRAWS,
 ) -> Ends | None:
     """Bootstrap over participants of the tolerance interval of a parameter through `x` (d,); None if no draw has an
     interval. With fewer than two participants with responses every number is NaN.
 
     `rule`: aggregation method that works point by point; `share`: shared variance fraction of the hierarchical one,
-    otherwise None.
+    otherwise None; `scale`: how participants differ in the use of the scale.
     """
     if not can_resample(posteriors):
         return Ends((math.nan, math.nan), (math.nan, math.nan), math.nan)
@@ -67,7 +70,9 @@ def tolerance_ends(
     means, explained, prior = _predictions(posteriors, points)
     count = means.shape[0]
     rows = jax.random.randint(jax.random.key(seed), (draws, count), 0, count)
-    inside = np.asarray(_dominant_in_draws(study, means, explained, prior, rows, rule, share)) & np.asarray(feasible)
+    inside = np.asarray(_dominant_in_draws(study, means, explained, prior, rows, rule, share, scale)) & np.asarray(
+        feasible
+    )
     ends = [_ends(row, middle) for row in inside if row[middle]]
     if not ends:
         return None
@@ -97,6 +102,7 @@ def _dominant_in_draws(
     rows: Int[Array, "draws M"],
     rule: str,
     share: ArrayLike | None,
+    scale: ScaleUse | None = None,
 ) -> Bool[Array, "draws m"]:
     """Whether the highest response is the most probable one of a new participant, (draws, m); `rows`: participants of
     each resample."""
@@ -104,7 +110,7 @@ def _dominant_in_draws(
     def one(chosen):
         mean, variance = aggregate(rule, means[chosen], explained[chosen], prior, share=share)
         apart = jnp.zeros_like(prior) if share is None else (1.0 - share) * prior  # a new person about the map
-        p = jax.vmap(study.gp.likelihood.class_probabilities)(mean, variance + apart)
+        p = class_probabilities(study.gp.likelihood, mean, variance + apart, scale)
         return p[:, -1] > jnp.max(p[:, :-1], axis=1)
 
     return jax.lax.map(one, rows)

@@ -1,12 +1,12 @@
-"""Does a new person give the highest answer as often as a map says? On simulated studies of many populations.
+"""Calibration of the probability that a new participant gives the highest answer, in simulated studies.
 
-    python benchmarks/promises.py FILE [--studies 10] [--first 1000] [--only NAME] [--design 24x25]
-    python benchmarks/promises.py FILE --write
+    python benchmarks/highest_answer.py FILE [--studies 10] [--first 1000] [--only NAME] [--design 24x25]
+    python benchmarks/highest_answer.py FILE --write
 
 FILE (JSON Lines) collects a row for each study; a run that was stopped goes on where it was. What has been run is in
-benchmarks/promises.jsonl. All rules have the same answers. learnt-3 was chosen on the presets paper-01, paper-04, ...
-paper-28, seeds 0 to 2; what is reported is of paper-02, paper-05, ... paper-29 and of the other populations, seeds from
-1000. --write puts the table into docs/methods/which_method.md.
+benchmarks/highest_answer.jsonl. All rules have the same answers. learnt-3 was chosen on the presets paper-01,
+paper-04, ... paper-28, seeds 0 to 2; what is reported is of paper-02, paper-05, ... paper-29 and of the other
+populations, seeds from 1000. --write puts the table into docs/methods/which_method.md.
 """
 
 import argparse
@@ -50,7 +50,7 @@ def main():
     chosen = options.parse_args()
     rows = Rows(chosen.file)
     if chosen.write:
-        put("methods/which_method.md", "promises", "\n".join(table(rows.rows)))
+        put("methods/which_method.md", "highest answer", "\n".join(table(rows.rows)))
         return
     known = {(row["population"], row["design"], row["seed"]) for row in rows}
     for seed in range(chosen.first, chosen.first + chosen.studies):
@@ -108,8 +108,8 @@ def by_rule(study, cohort, rule, candidates, chance, best, places, seed):
 
 def table(rows):
     """Lines of the table: by group of populations and rule."""
-    head = "populations", "rule", "studies", "bias at the optimum", "95 % intervals", "bias at tested, untested points"
-    yield f"| {' | '.join(head)} | regret | less learnt-2 |"
+    head = "populations", "rule", "studies", "bias at the optimum", "coverage of 95 % intervals"
+    yield f"| {' | '.join(head)} | bias at tested, untested points | regret | less learnt-2 |"
     yield "|---|---|---:|---:|---:|---:|---:|---:|"
     groups = {
         "`paper-02`, `paper-05`, … `paper-29`": lambda name: name in PAPER,
@@ -129,7 +129,7 @@ def cells(said, others):
     bias = [each["promise"] - each["true"] for each in said]
     yield f"{mean_and_error(bias)}"
     held = [each["low"] <= each["true"] <= each["high"] for each in said if "low" in each]
-    yield f"{np.mean(held):.0%} hold it" if len(held) == len(said) else "–"
+    yield f"{100 * np.mean(held):.0f} %" if len(held) == len(said) else "–"
     yield " ".join(f"{np.mean([each[f'{where} bias'] for each in said]):+.3f}" for where in ("tested", "untested"))
     regret = np.array([each["regret"] for each in said])
     yield mean_and_error(regret, sign="")
