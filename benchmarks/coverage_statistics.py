@@ -35,9 +35,9 @@ PERSON, PERSON_SET = 0.8, 0.6  # sd in logits
 JUDGE, SET, EFFECT = 0.6, 0.4, 1.05  # table IV: sd of participants and of sets, and the preference
 SHOWN, SETS, TWICE = 8, 24, 2
 CASES = {"differ": (1.0, False), "unequal": (1.0, True), "alike": (0.0, False)}  # scale of effects; unequal
-PERSONS = ["iid", "clustered by participant"]
+PERSONS = ["iid", "clustered by participant", "jackknife by participant"]
 KINDS = {"II": PERSONS, "III": PERSONS, "rate": ["Wilson", "exact"]}
-KINDS["IV"] = [*PERSONS, "clustered by set", "clustered by participant and set"]
+KINDS["IV"] = [*PERSONS, "clustered by set", "clustered by participant and set", "jackknife by set"]
 NODES, WEIGHTS = hermegauss(60)
 WEIGHTS = WEIGHTS / WEIGHTS.sum()
 
@@ -113,7 +113,7 @@ def intervals(name, table, truths):
             if separated or kind in mine.index
         }
         if "iid" in ends:
-            ends["the largest of iid and clustered"] = max(ends.values(), key=lambda pair: np.nan_to_num(np.ptp(pair)))
+            ends["the widest"] = max(ends.values(), key=lambda pair: np.nan_to_num(np.ptp(pair)))
         for kind, (low, high) in ends.items():
             rows.append((name, term, kind, bool(low <= truth <= high), high - low, separated))
     return rows
@@ -164,7 +164,9 @@ def page(results, studies):
 
 
 def order(name):
-    for place, begin in enumerate(("II", "III", "IV", "rate", "iid", "clustered", "the largest", "profile")):
+    for place, begin in enumerate(
+        ("II", "III", "IV", "rate", "iid", "clustered", "jackknife", "the widest", "profile")
+    ):
         if name == begin or (place > 3 and name.startswith(begin)):
             return place, name
     return 99, name

@@ -100,7 +100,11 @@ def by_rule(study, cohort, rule, candidates, chance, best, places, seed):
         row |= {f"{where} bias": float(gap.mean()), f"{where} error": float(np.abs(gap).mean())}
     if RULES[rule].learns:
         learnt = study.learnt
-        row |= {"sd": 0.0 if learnt.scale is None else float(learnt.scale.sd), "gain": float(learnt.gain_of_factors)}
+        row |= {
+            "spread": float(np.exp(learnt.coordinates.get("spread", -np.inf))),
+            "widths": "widths" in learnt.coordinates,
+        }
+        row |= {f"gain of {name}": float(gain) for name, gain in learnt.gains.items()}
         row |= {"converged": bool(learnt.converged)}
         row |= {"log evidence": float(learnt.log_evidence)}
     return row

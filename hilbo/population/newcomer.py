@@ -17,6 +17,8 @@ from hilbo.population.shared.scale_use import ScaleUse
 
 __all__ = ["InTurn", "class_probabilities", "in_turn", "log_highest", "predicted_in_turn", "with_variances"]
 
+_AT_A_TIME = 21  # nodes: each takes n^2 numbers for n responses
+
 
 def class_probabilities(
     likelihood: OrdinalProbit, mean: Float[Array, " m"], variance: Float[Array, " m"], scale: ScaleUse | None = None
@@ -30,10 +32,11 @@ def class_probabilities(
     if scale is None:
         return jax.vmap(likelihood.class_probabilities)(mean, variance)
 
-    def given(log_factor: Float[Array, ""]) -> Float[Array, "m C"]:
-        return jax.vmap(scale.of_person(likelihood, log_factor).class_probabilities)(mean, variance)
+    def given(person: OrdinalProbit) -> Float[Array, "m C"]:
+        return jax.vmap(person.class_probabilities)(mean, variance)
 
-    return jnp.tensordot(scale.weights, jax.vmap(given)(scale.log_factors), 1)
+    people, weights = scale.people(likelihood)
+    return jnp.tensordot(weights, jax.vmap(given)(people), 1)
 
 
 def log_highest(
@@ -49,8 +52,8 @@ def log_highest(
 
     if scale is None:
         return given(likelihood)
-    each = jax.vmap(lambda w: given(scale.of_person(likelihood, w)))(scale.log_factors)
-    return logsumexp(each, axis=0, b=scale.weights[:, None])
+    people, weights = scale.people(likelihood)
+    return logsumexp(jax.vmap(given)(people), axis=0, b=weights[:, None])
 
 
 def with_variances(covariance: Float[Array, "m m"], variance: Float[Array, " m"]) -> Float[Array, "m m"]:
@@ -95,11 +98,10 @@ def predicted_in_turn(
 
     if scale is None:
         return in_turn(likelihood, mean, covariance, q, mask)
-    people = jax.vmap(lambda w: scale.of_person(likelihood, w))(scale.log_factors)
-    each = jax.vmap(lambda person: in_turn(person, mean, covariance, q, mask))(people)
-    weights = jnp.log(scale.weights)
+    people, weights = scale.people(likelihood)
+    each = jax.lax.map(lambda person: in_turn(person, mean, covariance, q, mask), people, batch_size=_AT_A_TIME)
     logs = jnp.cumsum(jnp.where(mask, each.log_given, 0.0), axis=1)
-    before = weights[:, None] + jnp.pad(logs[:, :-1], ((0, 0), (1, 0)))
+    before = jnp.log(weights)[:, None] + jnp.pad(logs[:, :-1], ((0, 0), (1, 0)))
     share = jax.nn.log_softmax(before, axis=0)
     probabilities = jnp.einsum("kn,knc->nc", jnp.exp(share), each.probabilities)
     return InTurn(probabilities, logsumexp(share + each.log_given, axis=0))

@@ -3,7 +3,7 @@
 `validate` computes one material; `write_validation` makes the folder of `hilbo validate` with one section for each
 material: result.json, the tables as CSV, the figures, and one page. `hilbo report` uses the same parts.
 
-Of every coefficient the page shows the widest of the iid and clustered intervals, which docs/methods/statistics.md
+Of every coefficient the page shows the widest interval, which docs/methods/statistics.md
 finds the safest; all kinds of error are in the CSV tables.
 """
 
@@ -111,8 +111,8 @@ def _person(name, rows):
 
 
 def safest(table: Regression) -> pd.DataFrame:
-    """For each coefficient the row with the widest interval, among iid and clustered errors with a finite standard
-    error; the row with profile likelihood errors, if there is one.
+    """For each coefficient the row with the widest interval, among those with a finite standard error; the row with
+    profile likelihood errors, if there is one.
     """
     rows = []
     for _, mine in table.table.groupby("term", sort=False):

@@ -9,17 +9,26 @@ two-way one V_A + V_B - V_AB, AB being the intersections (Cameron, Gelbach & Mil
 statsmodels computes them. That difference may be indefinite, which statsmodels leaves as it is; its negative
 eigenvalues are set to 0 here, as the authors propose, and `Covariance.repaired` reports how large the worst was. t has
 G - 1 degrees of freedom, G of the smaller way.
+
+The cluster jackknife is the linearised one, CV3L, of MacKinnon, Nielsen & Webb (2024, arXiv:2406.00650): with H_g the
+information of cluster g,
+
+    V = (G - 1)/G · Σ_g d_g d_gᵀ,   d_g = (H - H_g)⁻¹ s_g,
+
+where -d_g is the Newton step from the estimate towards that without cluster g. It is larger than the above where few or
+unequal clusters decide an estimate.
 """
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from hilbo.statistics.ordered_logit import Fit
+from hilbo.statistics.ordered_logit import Design, Fit, information, orthogonal, scores
 
-__all__ = ["Covariance", "clustered"]
+__all__ = ["Covariance", "clustered", "jackknifed"]
 
 _ROUNDING = 1e-12
+_SINGULAR = 1e-8  # of an eigenvalue of the information without a cluster, in units of the whole one
 
 
 class Covariance(eqx.Module):
@@ -49,6 +58,27 @@ def clustered(fitted: Fit, *clusters: Int[np.ndarray, " n"]) -> Covariance:
     both_ways, first, second = cov_cluster_2groups(sandwich, *clusters)
     matrix, repaired = _repair(both_ways, first + second)
     return Covariance(matrix, degrees_of_freedom, repaired)
+
+
+def jackknifed(model: Design, fitted: Fit, clusters: Int[np.ndarray, " n"]) -> Covariance | None:
+    """Covariance by the linearised jackknife over `clusters` (n,), of which there are two at least.
+
+    None if without some cluster the others' responses do not determine the estimate. `model`: the design of `fitted`.
+    Computed where the columns are orthogonal, so that the predictors' units and origin do not matter.
+    """
+    from scipy.linalg import eigvalsh, solve_triangular
+
+    design, to_orthogonal = orthogonal(model)
+    estimate, each = to_orthogonal @ fitted.estimate, np.unique(clusters)
+    whole, by_answer, steps = information(design, estimate), scores(design, estimate), []
+    for cluster in each:
+        own = clusters == cluster
+        rest = whole - information(design.rows(own), estimate)
+        if eigvalsh(rest, whole)[0] < _SINGULAR:
+            return None
+        steps.append(np.linalg.solve(rest, by_answer[own].sum(axis=0)))
+    moved = solve_triangular(to_orthogonal, np.transpose(steps))
+    return Covariance((len(each) - 1) / len(each) * (moved @ moved.T), float(len(each) - 1), 0.0)
 
 
 def _repair(

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit, log_expit
 
-__all__ = ["Design", "Fit", "design", "fit", "information", "log_likelihood", "scores"]
+__all__ = ["Design", "Fit", "design", "fit", "information", "log_likelihood", "orthogonal", "scores"]
 
 _NEAR = 1e-6  # mean score at which the trust region hands over to Newton's method, which then takes a step or two
 _NO_MAXIMUM = "The logit did not reach its maximum: it has none, or its parameters are not unique."
@@ -133,24 +133,24 @@ def fit(model: Design, start: Float[np.ndarray, " k"]) -> Fit:
 
     `start` must have its edges in order, and a maximum must exist (`hilbo.statistics.separation`) and be unique. The
     trust region comes first because Newton's full steps alone failed in 1 of 8 fits of random small tables. Both work
-    in the coordinates of `_orthogonal`. Raises RuntimeError if no maximum is found.
+    in the coordinates of `orthogonal`. Raises RuntimeError if no maximum is found.
     """
     from scipy.linalg import solve_triangular
     from statsmodels.base.model import LikelihoodModel  # a third of a second: who fits nothing does not pay it
 
-    orthogonal, to_orthogonal = _orthogonal(model)
+    inner, to_orthogonal = orthogonal(model)
 
     class IntervalLogit(LikelihoodModel):
         """The likelihood under the names by which statsmodels asks for it."""
 
         def loglike(self, theta):
-            return log_likelihood(orthogonal, theta)
+            return log_likelihood(inner, theta)
 
         def score(self, theta):
-            return scores(orthogonal, theta).sum(axis=0)
+            return scores(inner, theta).sum(axis=0)
 
         def hessian(self, theta):
-            return -information(orthogonal, theta)
+            return -information(inner, theta)
 
     likelihood = IntervalLogit(np.zeros(len(model.upper)))  # statsmodels counts these; the answers are in `model`
     options = {"disp": 0, "warn_convergence": False, "skip_hessian": True}
@@ -169,11 +169,11 @@ def fit(model: Design, start: Float[np.ndarray, " k"]) -> Fit:
         estimate,
         results.llf,
         solve_triangular(to_orthogonal, half.T),
-        scores(orthogonal, results.params) @ to_orthogonal,
+        scores(inner, results.params) @ to_orthogonal,
     )
 
 
-def _orthogonal(model: Design) -> tuple[Design, Float[np.ndarray, "k k"]]:
+def orthogonal(model: Design) -> tuple[Design, Float[np.ndarray, "k k"]]:
     """Model in coordinates in which its columns are orthogonal and of equal size, and the matrix of the transformation.
 
     The upper triangular matrix maps coefficients to these coordinates, which makes the fit independent of the

@@ -5,6 +5,7 @@
 | iid | every response independent of every other |
 | clustered by A | A's clusters independent, and many; t with G - 1 degrees of freedom |
 | clustered by A and B | responses that share neither independent; t with the smaller G - 1 |
+| jackknife by A | as clustered by A; larger where few or unequal clusters decide an estimate |
 | profile likelihood | as iid; for a coefficient that has no finite estimate |
 
 `docs/methods/statistics.md` recommends which to use, from their coverage in simulated studies. statsmodels fits and
@@ -22,7 +23,7 @@ from scipy import stats
 
 from hilbo.errors import InputError
 from hilbo.statistics import ordered_logit
-from hilbo.statistics.cluster_robust import Covariance, clustered
+from hilbo.statistics.cluster_robust import Covariance, clustered, jackknifed
 from hilbo.statistics.columns import Columns, check_level, labels_of
 from hilbo.statistics.ordered_logit import Design, Fit
 from hilbo.statistics.separation import Separation, decisive, independent, profile, separation
@@ -108,7 +109,7 @@ def regress(
         rest, keep, rest_start = decisive(model, start, separated)
         fitted = ordered_logit.fit(rest, rest_start)
         log_likelihood = fitted.log_likelihood
-        kinds, refused = _kinds(fitted, {name: codes[~separated.certain] for name, codes in labels.items()})
+        kinds, refused = _kinds(rest, fitted, {name: codes[~separated.certain] for name, codes in labels.items()})
         kinds, estimate = [kind.in_units(units[keep]) for kind in kinds], fitted.estimate / units[keep]
         finite = {j: names[i] for j, i in enumerate(np.flatnonzero(keep)) if not separated.infinite[i]}
         warnings += [*refused, *_below_iid(kinds, finite)]
@@ -148,8 +149,9 @@ def _check_independent(model: Design, names: list[str], nuisance: int) -> None:
         )
 
 
-def _kinds(fitted: Fit, labels: Mapping[str, Int[np.ndarray, " n"]]) -> tuple[list[Errors], list[str]]:
-    """All kinds of standard errors that the data allow, iid first, and a sentence for each that they do not allow."""
+def _kinds(model: Design, fitted: Fit, labels: Mapping[str, Int[np.ndarray, " n"]]) -> tuple[list[Errors], list[str]]:
+    """All kinds of standard errors that the data allow, iid first, and a sentence for each that they do not allow.
+    `model`: the design of `fitted`."""
     kinds = [Errors("iid", "all answers are independent", Covariance(fitted.covariance, np.inf, 0.0))]
     counts = {name: len(np.unique(codes)) for name, codes in labels.items()}
     usable = [name for name, count in counts.items() if count > 1]
@@ -169,9 +171,16 @@ def _kinds(fitted: Fit, labels: Mapping[str, Int[np.ndarray, " n"]]) -> tuple[li
                 f"The covariance clustered by {both} was indefinite (worst eigenvalue {-covariance.repaired:.1%} of the"
                 " largest of the one-way terms) and was repaired; its errors may be too small."
             )
+    for name in usable:
+        covariance = jackknifed(model, fitted, labels[name])
+        if covariance is None:
+            warnings.append(f"Without one {name} the answers do not decide all coefficients: no jackknife by {name}.")
+            continue
+        assumes = f"answers that share no {name} are independent; clusters: {counts[name]} of {name}"
+        kinds.append(Errors(f"jackknife by {name}", assumes, covariance))
     few = min((counts[name] for name in usable), default=_FEW_CLUSTERS + 1)
     if few <= _FEW_CLUSTERS:
-        warnings.append(f"There are {few} clusters by one way: report the widest of the iid and clustered intervals.")
+        warnings.append(f"There are {few} clusters by one way: report the widest interval.")
     return kinds, warnings
 
 
@@ -179,7 +188,9 @@ def _below_iid(kinds: list[Errors], terms: Mapping[int, str]) -> list[str]:
     """A warning for each kind of clustered error that is smaller than the iid error of some coefficient. `kinds`: iid
     first; `terms`: index -> name of the coefficients to compare."""
     reference, sentences = kinds[0].std_errors, []
-    for kind in kinds[1:]:
+    for kind in kinds:
+        if not kind.name.startswith("clustered"):
+            continue
         errors = kind.std_errors
         less = {j: name for j, name in terms.items() if errors[j] < reference[j]}
         below = [f"{name} ({errors[j]:.3g} against {reference[j]:.3g})" for j, name in less.items()]

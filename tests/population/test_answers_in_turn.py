@@ -16,7 +16,7 @@ from hilbo.population import newcomer
 from hilbo.population.shared.scale_use import ScaleUse
 
 LIKELIHOOD = OrdinalProbit(jnp.array([-0.5, 0.8]), jnp.asarray(0.7))
-WIDTHS, SENSITIVITY = ScaleUse(jnp.asarray(0.4)), ScaleUse(jnp.asarray(0.5), True)
+WIDTHS, SENSITIVITY = ScaleUse(jnp.asarray(0.4)), ScaleUse(None, jnp.asarray(0.5))
 N, Q = 4, np.array([0, 2, 1, 2])
 ALL = jnp.ones(N, bool)
 class_probabilities, predicted_in_turn = map(eqx.filter_jit, (newcomer.class_probabilities, newcomer.predicted_in_turn))
@@ -49,8 +49,9 @@ def test_answers_are_predicted_from_those_before(scale):
         np.asarray,
         predicted_in_turn(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(covariance), jnp.asarray(Q), ALL, scale),
     )
-    people = [LIKELIHOOD] if scale is None else [scale.of_person(LIKELIHOOD, w) for w in scale.log_factors]
-    weights = [1.0] if scale is None else scale.weights
+    one = jax.tree.map(lambda leaf: leaf[None], LIKELIHOOD), jnp.ones(1)
+    stacked, weights = one if scale is None else scale.people(LIKELIHOOD)
+    people = [jax.tree.map(lambda leaf, k=k: leaf[k], stacked) for k in range(len(weights))]
     joint = sum(w * boxes(person, mean, covariance) for w, person in zip(weights, people, strict=True))
     np.testing.assert_allclose(predicted, joint / joint.sum(axis=1, keepdims=True), atol=0.02)
     alone = np.asarray(class_probabilities(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(np.diagonal(covariance)), scale))

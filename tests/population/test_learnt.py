@@ -206,6 +206,6 @@ def test_widths_are_found_where_people_have_them():
         half = 2.2 if j % 2 else 0.25
         each.append(Trials.from_arrays(x, (felt > 0.5 - half).astype(int) + (felt > 0.5 + half), 60))
     end = learn(jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *each), 3)
-    assert end.gain_of_factors > 3
+    assert end.gains["widths"] > 3
     widths = np.asarray(end.coordinates["widths"])
     assert widths[1::2].min() > widths[::2].max() + 0.5

@@ -125,13 +125,18 @@ def test_widths_are_thresholds_of_their_own():
     np.testing.assert_allclose(evidence(people, apart(trials)).value, total, rtol=1e-12)
 
 
-def test_sensitivities_scale_thresholds_and_noise_about_the_highest():
+@pytest.mark.parametrize("fixed_point", [None, 1.0, 0.0])
+def test_sensitivities_scale_thresholds_and_noise_about_the_fixed_point(fixed_point):
     """Nothing shared: everybody's evidence is that of a fit with their own thresholds and noise."""
-    factors = (0.4, -0.3, 0.0)
-    trials, alike = stacked(), model(shared=0.0, own=0.9, log_widths=factors)
-    people, total = dataclasses.replace(alike, sensitivity=True), 0.0
-    for j, factor in enumerate(np.exp(factors)):
-        likelihood = OrdinalProbit(0.5 + factor * np.array([-0.9, 0.0]), factor * 0.7)
+    log_widths, log_sensitivities = (0.4, -0.3, 0.0), (-0.2, 0.1, 0.5)
+    trials, alike = stacked(), model(shared=0.0, own=0.9, log_widths=log_widths)
+    at = None if fixed_point is None else jnp.asarray(fixed_point)
+    people = dataclasses.replace(alike, log_sensitivities=jnp.asarray(log_sensitivities), fixed_point=at)
+    total = 0.0
+    for j, (width, factor) in enumerate(zip(np.exp(log_widths), np.exp(np.negative(log_sensitivities)), strict=True)):
+        own = 0.05 + width * np.array([-0.45, 0.45])
+        fixed = 0.05 if fixed_point == 0.0 else own[1]
+        likelihood = OrdinalProbit(fixed + factor * (own - fixed), factor * 0.7)
         person = jax.tree.map(lambda leaf, j=j: np.asarray(leaf)[j], trials)
         total += float(alone(OrdinalGP(RBF((3.0, 5.0), 0.9), likelihood), person))
     np.testing.assert_allclose(evidence(people, apart(trials)).value, total, rtol=1e-12)

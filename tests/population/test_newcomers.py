@@ -149,33 +149,38 @@ MEAN, VARIANCE = jnp.array([0.3, -1.0, 4.0]), jnp.array([0.2, 0.5, 2.0])
 class_probabilities, log_highest = map(eqx.filter_jit, (newcomer.class_probabilities, newcomer.log_highest))
 
 
-WIDTHS, SENSITIVITY = ScaleUse(jnp.asarray(0.4)), ScaleUse(jnp.asarray(0.4), True)
-WIDE = ScaleUse(jnp.asarray(0.8), True)
+WIDTHS, WIDE = ScaleUse(jnp.asarray(0.4)), ScaleUse(sensitivity=jnp.asarray(0.8))
+SENSITIVITY = ScaleUse(sensitivity=jnp.asarray(0.4))
+BOTH = ScaleUse(jnp.asarray(0.4), jnp.asarray(0.5))
+MIDDLE = ScaleUse(sensitivity=jnp.asarray(0.8), fixed_point=jnp.asarray(0.0))
 
 
-def by_quadrature(mean, variance, category, pivot, sd):
-    """Over the log factor, N(0, sd^2): of the widths, or of a function that is divided by it about the pivot."""
+def by_quadrature(mean, variance, category, scale):
+    """Over the log factors: of the widths about the middle, then of a function that is multiplied by the sensitivity
+    about the highest threshold, or their middle."""
     edges = np.array([-np.inf, -0.5, 0.2, 1.3, np.inf])
 
-    def given(w):
-        if pivot is None:
-            ends, at, variance_at = edges[1:4].mean() * (1 - np.exp(w)) + np.exp(w) * edges, mean, variance
-        else:
-            ends, at, variance_at = edges, pivot + (mean - pivot) / np.exp(w), variance / np.exp(2 * w)
-        low, high = (ends[category : category + 2] - at) / np.sqrt(0.8**2 + variance_at)
-        return (norm.cdf(high) - norm.cdf(low)) * norm.pdf(w, 0.0, sd)
+    def given(w, s):
+        ends = edges[1:4].mean() * (1 - np.exp(w)) + np.exp(w) * edges
+        fixed = ends[3] if scale.fixed_point is None else ends[1:4].mean()
+        at = fixed + (mean - fixed) * np.exp(s)
+        low, high = (ends[category : category + 2] - at) / np.sqrt(0.8**2 + variance * np.exp(2 * s))
+        return norm.cdf(high) - norm.cdf(low)
 
-    return quad(given, -9 * sd, 9 * sd, epsabs=1e-12)[0]
+    def over(f, sd):
+        return f(0.0) if sd is None else quad(lambda u: f(u) * norm.pdf(u, 0, sd), -9 * sd, 9 * sd, epsabs=1e-11)[0]
+
+    return over(lambda w: over(lambda s: given(w, s), scale.sensitivity), scale.width)
 
 
-@pytest.mark.parametrize(("scale", "pivot"), [(WIDTHS, None), (SENSITIVITY, 1.3), (WIDE, 1.3)])
-def test_the_use_of_the_scale_is_integrated_out(scale, pivot):
-    pairs = zip(*map(np.asarray, (MEAN, VARIANCE)), strict=True)
-    expected = [[by_quadrature(*pair, c, pivot, float(scale.sd)) for c in range(4)] for pair in pairs]
+@pytest.mark.parametrize("scale", [WIDTHS, SENSITIVITY, WIDE, MIDDLE, pytest.param(BOTH, marks=pytest.mark.deep)])
+def test_the_use_of_the_scale_is_integrated_out(scale):
+    pairs, sds = zip(*map(np.asarray, (MEAN, VARIANCE)), strict=True), jax.tree.map(float, scale)
+    expected = [[by_quadrature(*pair, c, sds) for c in range(4)] for pair in pairs]
     np.testing.assert_allclose(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, scale), expected, atol=2e-5)
 
 
-@pytest.mark.parametrize("scale", [None, WIDTHS, SENSITIVITY])
+@pytest.mark.parametrize("scale", [None, WIDTHS, SENSITIVITY, BOTH])
 def test_the_highest_category_is_the_last_one(scale):
     chances = np.asarray(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, scale))
     np.testing.assert_allclose(np.exp(log_highest(LIKELIHOOD, MEAN, VARIANCE, scale)), chances[:, -1], rtol=1e-12)

@@ -2,11 +2,13 @@
 
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
 from studies import plain
 
+from hilbo.population.maps import RuleMap
 from hilbo.report.study.hypotheses import _convergence, _individuals, _largest, _validation
 
 
@@ -30,19 +32,23 @@ def test_a_tie_of_answers_says_nothing_whichever_way_the_scale_runs(counts, side
 
 
 @pytest.mark.parametrize(
-    ("first", "last", "chances", "sides"),
+    ("first", "last", "sixth", "chances", "sides"),
     [
-        ([2, 0], [2, 0], [[0.2, 0.3, 0.5], [0.5, 0.3, 0.2]], ["inconclusive", "inconclusive"]),
-        ([2, 0], [2, 2], [[0.2, 0.3, 0.5], [0.4, 0.2, 0.4]], ["supports", "inconclusive"]),
-        ([2, 2], [2, 0], [[0.2, 0.3, 0.5], [0.2, 0.3, 0.5]], ["contradicts", "supports"]),
-        ([0, 0], [0, 0], [[0.5, 0.3, 0.2], [0.2, 0.6, 0.2]], ["inconclusive", "contradicts"]),
+        ([2, 0], [2, 0], [2, 0, 2, 0], [[0.2, 0.3, 0.5], [0.5, 0.3, 0.2]], ["inconclusive", "inconclusive"]),
+        ([2, 0], [2, 2], [0, 0, 2, 2], [[0.2, 0.3, 0.5], [0.4, 0.2, 0.4]], ["supports", "inconclusive"]),
+        ([2, 2], [2, 0], [2, 2, 0, 0], [[0.2, 0.3, 0.5], [0.2, 0.3, 0.5]], ["contradicts", "supports"]),
+        ([0, 0], [0, 0], [0, 0, 0, 0], [[0.5, 0.3, 0.2], [0.2, 0.6, 0.2]], ["inconclusive", "contradicts"]),
+        ([2, 0], [2, 2], [2, 0, 2, 2], [[0.2, 0.3, 0.5], [0.4, 0.2, 0.4]], ["inconclusive", "inconclusive"]),
     ],
 )
-def test_equal_shares_and_half_of_the_people_say_nothing(first, last, chances, sides):
-    answers = np.array([[*first, 1, 1, *last]] * 2)
-    trials = SimpleNamespace(q=answers, mask=np.ones((2, 6), bool))
-    cohort = SimpleNamespace(names=("A", "B"), trials=trials, counts=lambda: np.full(2, 6))
-    aggregate = SimpleNamespace(individuals=SimpleNamespace(class_probabilities=np.array(chances)))
+def test_equal_shares_half_of_the_people_and_differences_without_a_spread_say_nothing(
+    first, last, sixth, chances, sides
+):
+    """Six people, of whom five answer alike: in the first two trials, in two between, and in the last two."""
+    answers = np.array([[*first, 1, 1, *last]] * 5 + [[*sixth[:2], 1, 1, *sixth[2:]]])
+    trials = SimpleNamespace(q=answers, mask=np.ones((6, 6), bool))
+    cohort = SimpleNamespace(names=tuple("ABCDEF"), trials=trials, counts=lambda: np.full(6, 6))
+    aggregate = SimpleNamespace(individuals=SimpleNamespace(class_probabilities=np.array(chances * 3)))
     progress = SimpleNamespace(counts=np.arange(2), splits=0)
     analysis = SimpleNamespace(study=plain(), cohort=cohort, aggregate=aggregate, progress=progress)
     assert [item.side for item in _individuals(SimpleNamespace(analysis=analysis))] == sides
@@ -67,8 +73,7 @@ def test_individuals_and_halves_are_compared_with_an_interval(farther, side, wor
     progress = SimpleNamespace(
         counts=np.array([1, 8, 25]), splits=2, halves=np.full((3, 4), 0.35), individual_to_half=distances
     )
-    analysis = SimpleNamespace(
-        progress=progress, aggregate=SimpleNamespace(map=SimpleNamespace(rule="bcm", method="by points"))
-    )
+    map_ = RuleMap("bcm", "by points", None, None, jnp.zeros(()), jnp.ones(()))
+    analysis = SimpleNamespace(progress=progress, aggregate=SimpleNamespace(map=map_))
     (item,) = _convergence(SimpleNamespace(analysis=analysis, reference=None))
     assert item.side == side and words in item.text

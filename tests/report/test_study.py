@@ -92,15 +92,15 @@ def test_convergence_is_judged_by_people_who_are_not_among_them():
     """Not by a study's own last point, to which everything comes, random answers too."""
     one = jnp.ones(())
     aggregate = SimpleNamespace(map=RuleMap("bcm", "by points", None, None, one, one))
-    still = np.zeros((6, 3, 1))
+    still, apart = np.zeros((6, 3, 1)), np.array([[0.0, 0.01, -0.01]] * 6)
     for halves, own, side in ((0.1, 0.2, "supports"), (0.3, 0.2, "contradicts")):
         progress = Progress(
-            np.arange(1, 7), still[:, 0], still, np.full(3, 6), np.full((6, 4), halves), np.full((6, 3), own), {}
+            np.arange(1, 7), still[:, 0], still, np.full(3, 6), np.full((6, 4), halves), own + apart, {}
         )
         analysis = SimpleNamespace(progress=progress, aggregate=aggregate)
         (item,) = _convergence(SimpleNamespace(analysis=analysis, reference=None))
         assert item.side == side and f"{100 * halves:.0f} % (NRMSE, median of 4" in item.text
-    own = np.linspace(0.5, 0.2, 6)[:, None] + np.array([0.0, 0.01, -0.01])
+    own = np.linspace(0.5, 0.2, 6)[:, None] * np.array([1.0, 1.02, 0.98])
     assert _nearer_to_others(progress._replace(individual_to_half=own)).side == "supports"
     assert _nearer_to_others(progress._replace(individual_to_half=own[::-1])).side == "contradicts"
     random = np.random.default_rng(0).uniform(size=(6, 3))
@@ -110,7 +110,7 @@ def test_convergence_is_judged_by_people_who_are_not_among_them():
 def test_other_materials_are_the_others():
     """H1 to H3 are of the first material, and its figures are no evidence for H4."""
     study, validated = plain(), validate(paper_counts(np.random.default_rng(4), ties=20))
-    optimum, own = SimpleNamespace(x=jnp.array([0.5, 0.5])), SimpleNamespace(x=jnp.array([[0.1, 0.5], [0.9, 0.5]]))
+    optimum, own = SimpleNamespace(x=jnp.array([0.5, 0.5])), SimpleNamespace(x=jnp.array([[0.1, 0.5], [0.92, 0.5]]))
     analysis = SimpleNamespace(study=study, aggregate=SimpleNamespace(optimum=optimum, individuals=own))
     parts = {"analysis": analysis, "reference_name": "the truth"}
     first, second, third = (

@@ -75,11 +75,11 @@ def test_what_one_comparison_can_say():
 
 @pytest.mark.parametrize(("people", "few"), [(9, True), (14, False)])
 def test_what_is_shown_is_what_the_warning_says_to_report(people, few):
-    """The widest of the iid and clustered intervals; few clusters are warned about."""
+    """The widest interval of all kinds of errors; few clusters are warned about."""
     answers = paper_counts(np.random.default_rng(1))
     names = answers["participant"].unique()[:people]
     table = validate(answers[answers["participant"].isin(names)]).regressions()["II"]
-    assert any("report the widest of the iid and clustered" in words for words in table.warnings) == few
+    assert any("report the widest interval" in words for words in table.warnings) == few
     widest = (table.table["high"] - table.table["low"]).groupby(table.table["term"]).max()
     rows = safest(table).set_index("term")
     np.testing.assert_array_equal(rows["high"] - rows["low"], widest[rows.index])

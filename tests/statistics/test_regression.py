@@ -158,3 +158,27 @@ def test_one_participant_gives_iid_errors_only():
     fitted = st.binary_logit([1, 0, 1, 1], None, {"participant": ["P"] * 4})
     assert list(fitted.table["errors"]) == ["iid"]
     assert fitted.warnings == ("There is one participant only: no error can be clustered by it.",)
+
+
+def test_the_jackknife_is_near_that_of_refits_and_wider_with_unequal_clusters():
+    rng = np.random.default_rng(7)
+    who = np.repeat(np.arange(8), [60, 40, 20, 15, 10, 8, 5, 4])
+    x = rng.normal(size=len(who)) + who / 8
+    y = rng.logistic(size=len(who)) + 0.8 * x + rng.normal(size=8)[who] > 0
+    fitted = st.binary_logit(y, {"x": x}, {"person": who})
+    without = np.array([st.binary_logit(y[who != g], {"x": x[who != g]}).by("iid")["estimate"] for g in range(8)])
+    moved = without - fitted.by("iid")["estimate"].to_numpy()
+    by_refits = np.sqrt(7 / 8 * np.sum(moved**2, axis=0))
+    errors = fitted.by("jackknife by person")["std_error"]
+    np.testing.assert_allclose(errors, by_refits, rtol=0.2)  # with 60 of 162 answers in one cluster
+    assert np.all(errors > fitted.by("clustered by person")["std_error"])
+    assert np.all(fitted.by("jackknife by person")["degrees_of_freedom"] == 7)
+
+
+def test_there_is_no_jackknife_where_one_cluster_decides():
+    """Only person 0 was asked with x = 1."""
+    x, who = np.repeat([0.0, 1.0], [12, 4]), np.repeat([0, 1, 2, 0], 4)
+    y = np.tile([True, False], 8)
+    fitted = st.binary_logit(y, {"x": x}, {"person": who})
+    assert not fitted.table["errors"].str.startswith("jackknife").any()
+    assert "Without one person the answers do not decide all coefficients: no jackknife by person." in fitted.warnings

@@ -47,7 +47,7 @@ def chance(function, shift, sd):
 
 @pytest.mark.parametrize("sd", [1e-3, 0.5])
 def test_the_interval_is_of_the_shared_function(function, sd):
-    found = highest_answer(STUDY, map_of(function, ScaleUse(jnp.asarray(sd), sensitivity=True)), X)
+    found = highest_answer(STUDY, map_of(function, ScaleUse(sensitivity=jnp.asarray(sd))), X)
     np.testing.assert_allclose([found.low, found.high], [chance(function, z, sd) for z in (-1.96, 1.96)], atol=2e-3)
     expected = quad(lambda z: chance(function, z, sd) * norm.pdf(z), -6, 6)[0]
     assert found.low < found.probability < found.high and found.probability == pytest.approx(expected, abs=2e-4)
@@ -70,7 +70,7 @@ def test_methods_that_do_not_predict_it_do_not_say_it(function, rule):
 
 def test_tolerances_are_read_where_a_new_participant_s_likeliest_response_is_the_highest(function):
     """With sensitivities, which change the other responses' probabilities: as the figure of the classes has it."""
-    scale = ScaleUse(jnp.asarray(0.8), sensitivity=True)
+    scale = ScaleUse(sensitivity=jnp.asarray(0.8))
     map_ = map_of(function, scale)
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(400, 2)))
     chances = np.asarray(map_.class_probabilities(GP.likelihood, x))

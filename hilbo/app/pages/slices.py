@@ -45,9 +45,9 @@ class Maps:
             progress.trust(self._chooser, block, fitted, fitted.point, following)
 
     def trust(self, state: LiveSession) -> list[list[str]]:
-        """How far the session has come, as rows of name and value: the best rendering so far, its probability of the
-        highest answer, its expected shift with one more trial, and the agreement of repeated trials. Only rows that are
-        known; of the block that is running, or the last one."""
+        """How far the session has come, as rows of name and value: the best rendering so far, its expected shift with
+        one more trial, and the agreement of repeated trials. Only rows that are known; of the block that is running, or
+        the last one."""
         rows = []
         chosen = [i for i in self._chooser.chosen_blocks if state.answers(i)]
         block = next((i for i in chosen if not state.full(i)), chosen[-1] if chosen else None)
@@ -56,8 +56,6 @@ class Maps:
             parameters = ((p, trust.best[p.name]) for p in state.study.space.parameters)
             named = (f"{p.name} {p.words(value) if p.levels else f'{value:.3g}'}" for p, value in parameters)
             rows.append(["Best so far", ", ".join(named)])
-            top = state.study.responses[-1]
-            rows.append([f'… would be "{top}"', f"{100 * trust.top:.0f} %"])
             if trust.movement is not None:
                 rows.append(["… moves with one more", f"by {100 * trust.movement:.1f} % of the ranges"])
         twice = progress.consistency(state)

@@ -84,8 +84,10 @@ class Problem(eqx.Module):
     theta: Float[Array, " d"]
     """By which they were chosen."""
     information: Float[Array, " M"] | None = None
-    """Curvature (M,), at least 0, of the log evidence in each participant's log factor, with which Laplace's method
-    integrates these out; the spread of sensitivities could not be learnt from their maximum."""
+    """Curvature (M,), at least 0, of the log evidence in each participant's log sensitivity, with which Laplace's
+    method integrates these out; their spread could not be learnt from their maximum."""
+    fixed_point: Float[Array, ""] | None = None
+    """Of the sensitivities, as in `PeopleModel`."""
 
 
 class Cost(NamedTuple):
@@ -123,7 +125,7 @@ def cost_at(coordinates: Coordinates, start: Float[Array, "M n"], problem: Probl
     """
 
     def value(coordinates):
-        model = model_at(coordinates, problem.answers, problem.stated, problem.kernel)
+        model = model_at(coordinates, problem.answers, problem.stated, problem.kernel, problem.fixed_point)
         evidence = shared_evidence(model, problem.answers, start, problem.pivots)
         return -evidence.value - _log_prior(coordinates, problem), evidence
 
@@ -148,16 +150,20 @@ def medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior], kerne
         "widths": jnp.full(people, priors["widths"].mean, dtype),
         "effect": jnp.asarray(priors["effect"].mean, dtype),
     }
-    if "sensitivity" in priors:
-        every["sensitivity"] = jnp.asarray(priors["sensitivity"].mean, dtype)
     kept = {"theta"} if stated.theta is not None else set()
     kept |= {"middle", "gaps"} if stated.thresholds is not None else set()
-    kept |= {"widths"} if categories < 3 and "sensitivity" not in priors else set()
+    kept |= {"widths"} if categories < 3 else set()
     kept |= {"effect"} if answers.context is None else set()
     return {name: value for name, value in every.items() if name not in kept and value.size}
 
 
-def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated, kernel: type[Stationary]) -> PeopleModel:
+def model_at(
+    coordinates: Coordinates,
+    answers: Tallies,
+    stated: Stated,
+    kernel: type[Stationary],
+    fixed_point: Float[Array, ""] | None = None,
+) -> PeopleModel:
     """Hyperparameters at the given coordinates, completed by the specified ones (`stated`).
 
     Their unit is the specified noise, or the specified variance, or else a noise of 1. Only the shapes of `answers` are
@@ -184,23 +190,24 @@ def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated, kernel:
         thresholds = jnp.asarray(stated.thresholds, dtype)
     widths = coordinates.get("widths", jnp.zeros(people, dtype))
     effect = noise**2 * jnp.exp(coordinates["effect"]) if "effect" in coordinates else None
-    sensitivity = "sensitivity" in coordinates
-    return PeopleModel(theta, shared, own, thresholds, noise, widths, kernel, stated.counts, effect, sensitivity)
+    sensitivities = coordinates.get("sensitivities")
+    return PeopleModel(
+        theta, shared, own, thresholds, noise, widths, kernel, stated.counts, effect, sensitivities, fixed_point
+    )
 
 
 def _log_prior(coordinates: Coordinates, problem: Problem) -> Float[Array, ""]:
-    """Log prior density of the coordinates, up to a constant: a scalar, in nats. If the spread of sensitivities is
-    learnt, these have that standard deviation, and the log of the Laplace factor of their integral is added.
+    """Log prior density of the coordinates, up to a constant: a scalar, in nats. With sensitivities, the log of the
+    Laplace factor of their integral is added.
     """
     d = problem.answers.x.shape[-1]
     total = jnp.zeros((), problem.answers.x.dtype)
     for name, value in coordinates.items():
-        mean, sd = problem.priors[name]
-        sd = jnp.exp(coordinates["sensitivity"]) if name == "widths" and "sensitivity" in coordinates else sd
+        mean, sd = (0.0, jnp.exp(coordinates["spread"])) if name == "sensitivities" else problem.priors[name]
         lowered = _lowered(problem.stated, problem.priors[name], problem.kernel, d) if name == "theta" else 0.0
         total -= 0.5 * jnp.sum(((value - mean + lowered) / sd) ** 2)
-    if "sensitivity" in coordinates and problem.information is not None:
-        total -= 0.5 * jnp.sum(jnp.log1p(jnp.exp(2 * coordinates["sensitivity"]) * problem.information))
+    if problem.information is not None:
+        total -= 0.5 * jnp.sum(jnp.log1p(jnp.exp(2 * coordinates["spread"]) * problem.information))
     return total
 
 

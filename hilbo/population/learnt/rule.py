@@ -1,13 +1,13 @@
 """The hierarchical model with hyperparameters learnt from all responses, by a recipe of `rules.recipes`.
 
 The hyperparameters maximise the Laplace evidence of all responses times the recipe's priors, by L-BFGS from the priors'
-medians, at first with the same use of the scale for all participants; then with individual widths or sensitivities,
+medians, at first with the same use of the scale for all participants; then with individual sensitivities and widths,
 which are kept if they are worth it by the evidence. Hyperparameters that the study specifies are fixed, and with a
 specified noise, or variance, all others are in its unit. Their uncertainty is from a normal approximation of the
 posterior; one that is hardly narrower than its prior is not identified.
 """
 
-from collections.abc import Set
+from collections.abc import Callable, Set
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hilbo.errors import InputError
 from hilbo.numerics.shown import shown
 from hilbo.ordinal_gp import Posterior, Trials
-from hilbo.population.learnt.factors import FACTORS, FINE, Chosen, with_factors_if_worth
+from hilbo.population.learnt.factors import FINE, Chosen, diagonals, with_factors_if_worth
 from hilbo.population.learnt.posterior import (
     KERNELS,
     NOTHING,
@@ -37,7 +37,7 @@ from hilbo.population.rules.recipes import LEARNT_1, WIDTHS, Recipe
 from hilbo.population.shared.features import pivots_for, unexplained
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.posterior import SharedFunction, shared_function
-from hilbo.population.shared.scale_use import ScaleUse
+from hilbo.population.shared.scale_use import INDIVIDUAL, ScaleUse
 from hilbo.population.shared.tallies import Tallies, tallied
 
 __all__ = [
@@ -52,12 +52,12 @@ __all__ = [
 _ROUGH = 0.05
 _AT_A_TIME = 2  # draws: much of their arithmetic is of one core
 _MOST_FEATURES, _NUMBERS = 1024, 64_000_000  # of the shared function; of all people's features, half a gigabyte
-_WHOLE = 32  # people, up to whom the curvature in all widths is made: a gradient or two each
+_WHOLE = 32  # people, up to whom the curvature in all individual coordinates is made: a gradient or two each
 
 
 class Learnt(eqx.Module):
     """Hyperparameters learnt from all responses, with a normal approximation of their posterior: `sd` by coordinate,
-    and `covariance` (k, k) without widths. `converged`: the search ended at a maximum with accurate features.
+    and `covariance` (k, k) without individual ones. `converged`: the search ended at a maximum with accurate features.
     """
 
     recipe: str = eqx.field(static=True)
@@ -71,10 +71,10 @@ class Learnt(eqx.Module):
     sd: Coordinates
     """Standard deviations of their posterior."""
     covariance: Float[Array, "k k"]
-    """Of their posterior, without widths: one after the other, as `ravel_pytree` has them."""
-    gain_of_factors: Float[Array, ""]
-    """What individual widths, or sensitivities, add to the log evidence; they are in the model if it is more than the
-    recipe's `worth`."""
+    """Of their posterior, without widths and sensitivities: one after the other, as `ravel_pytree` has them."""
+    gains: dict[str, Float[Array, ""]]
+    """Gain of log evidence by individual "sensitivities" and "widths", as far as they were tried; those that gained
+    enough (`factors`) are in the model."""
     steps: Int[Array, ""]
     rank: Int[Array, ""]
     left: Float[Array, ""]
@@ -92,7 +92,7 @@ class Learnt(eqx.Module):
     @property
     def scale(self) -> ScaleUse | None:
         """How participants differ in the use of the scale; None if they do not, by the evidence."""
-        return _scale_at(self.coordinates)
+        return _scale_at(self.coordinates, self.model.fixed_point)
 
 
 def learnt_function(learnt: Learnt, trials: Trials) -> SharedFunction:
@@ -124,7 +124,7 @@ class DrawnMap(NamedTuple):
 
 
 def drawn_maps(learnt: Learnt, trials: Trials, stated: Stated, seed: int, count: int) -> list[DrawnMap]:
-    """Maps for `count` draws of the hyperparameters from their normal posterior; individual widths or sensitivities
+    """Maps for `count` draws of the hyperparameters from their normal posterior; individual sensitivities and widths
     stay.
 
     Draws whose fit does not converge are left out; the list is empty if the covariance is not positive definite, since
@@ -136,31 +136,29 @@ def drawn_maps(learnt: Learnt, trials: Trials, stated: Stated, seed: int, count:
     values, vectors = np.linalg.eigh(covariance)
     if not np.all(values > 0):
         return []
-    flat, restore = ravel_pytree({name: value for name, value in learnt.coordinates.items() if name != "widths"})
-    widths = {name: value for name, value in learnt.coordinates.items() if name == "widths"}
+    flat, restore = ravel_pytree({name: value for name, value in learnt.coordinates.items() if name not in INDIVIDUAL})
+    individual = {name: value for name, value in learnt.coordinates.items() if name in INDIVIDUAL}
     steps = np.random.default_rng([seed, count]).standard_normal((count, flat.size)) * np.sqrt(values) @ vectors.T
     unit, answers = learnt.model.unit, _as_learnt(learnt, trials)
     rank = len(pivots_for(unit, answers).points)
 
     def drawn(step: Float[np.ndarray, " k"]) -> DrawnMap:
-        coordinates = widths | restore(flat + step)
-        model = model_at(coordinates, answers, stated, type(unit))
+        coordinates = individual | restore(flat + step)
+        model = model_at(coordinates, answers, stated, type(unit), learnt.model.fixed_point)
         pivots = pivots_for(model.unit, answers, fewest=rank, most=rank)
         function = jax.block_until_ready(shared_function(model, answers, learnt.weights, pivots).function)
-        return DrawnMap(function, model, _scale_at(coordinates))
+        return DrawnMap(function, model, _scale_at(coordinates, learnt.model.fixed_point))
 
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
         maps = list(pool.map(drawn, steps))
     return [each for each in maps if bool(each.function.certificate.converged)]
 
 
-def _scale_at(coordinates: Coordinates) -> ScaleUse | None:
+def _scale_at(coordinates: Coordinates, fixed_point: Float[Array, ""] | None) -> ScaleUse | None:
     """How participants differ in the use of the scale at these coordinates; None if they do not."""
-    if "widths" not in coordinates:
-        return None
-    if "sensitivity" in coordinates:
-        return ScaleUse(jnp.exp(coordinates["sensitivity"]), sensitivity=True)
-    return ScaleUse(jnp.asarray(WIDTHS.sd, coordinates["widths"].dtype))
+    width = jnp.asarray(WIDTHS.sd, coordinates["widths"].dtype) if "widths" in coordinates else None
+    sensitivity = jnp.exp(coordinates["spread"]) if "spread" in coordinates else None
+    return None if width is None and sensitivity is None else ScaleUse(width, sensitivity, fixed_point)
 
 
 def learn(
@@ -181,13 +179,13 @@ def learn(
         raise InputError(f"{recipe.name}: nobody gave an answer; at least one person's answers are needed.")
     answers = tallied(trials, categories, 0 if near is None else near.weights.shape[1])
     start = medians(answers, stated, recipe.priors, KERNELS[recipe.kernel])
-    common = frozenset(start) - FACTORS
+    common = frozenset(start) - {"widths"}
     if near is not None:
         start |= {name: near.coordinates[name] for name in common}
     begun, problem = first_search(start, answers, stated, recipe)
     if near is not None and not bool(begun.cost.usable):
         return learn(trials, categories, stated, recipe)
-    chosen = with_factors_if_worth(*searched(begun, problem, common), frozenset(start), recipe)
+    chosen = with_factors_if_worth(*searched(begun, problem, common), recipe)
     return _recorded(chosen, *_posterior_spread(chosen.search, chosen.problem, chosen.free), recipe)
 
 
@@ -203,14 +201,14 @@ def not_learnt(trials: Trials, categories: int, stated: Stated = NOTHING, recipe
         medians(answers, stated, recipe.priors, KERNELS[recipe.kernel]), answers, stated, recipe
     )
     nothing = jnp.zeros((0, 0), trials.x.dtype)
-    return _recorded(Chosen(search, problem, frozenset(), 0.0), {}, nothing, recipe)
+    return _recorded(Chosen(search, problem, frozenset(), {}), {}, nothing, recipe)
 
 
 def _recorded(chosen: Chosen, sd: Coordinates, covariance: Float[Array, "k k"], recipe: Recipe) -> Learnt:
     """Result of a search, with the standard deviations and the covariance of its coordinates."""
-    search, problem, free, gain = chosen
+    search, problem, free, gains = chosen
     answers = problem.answers
-    model = model_at(search.coordinates, answers, problem.stated, problem.kernel)
+    model = model_at(search.coordinates, answers, problem.stated, problem.kernel, problem.fixed_point)
     left = unexplained(model.unit, answers, problem.pivots)
     return Learnt(
         recipe=recipe.name,
@@ -220,7 +218,7 @@ def _recorded(chosen: Chosen, sd: Coordinates, covariance: Float[Array, "k k"], 
         coordinates={name: value for name, value in search.coordinates.items() if name in free},
         sd=sd,
         covariance=covariance,
-        gain_of_factors=jnp.asarray(gain),
+        gains={name: jnp.asarray(gain) for name, gain in gains.items()},
         steps=jnp.asarray(search.steps),
         rank=jnp.asarray(len(problem.pivots.points)),
         left=left,
@@ -231,16 +229,14 @@ def _recorded(chosen: Chosen, sd: Coordinates, covariance: Float[Array, "k k"], 
 
 def _posterior_spread(search: Search, problem: Problem, free: Set[str]) -> tuple[Coordinates, Float[Array, "k k"]]:
     """Posterior standard deviations of the `free` coordinates, by a normal approximation, and their covariance (k, k)
-    without widths.
+    without widths and sensitivities.
 
     The curvature is from differences of gradients at the end of the search. A standard deviation is infinite where the
     variance comes out not positive: then there is no maximum.
-
-    Widths of more than 32 participants are taken as independent given the rest. Each one's curvature is then the row
-    sum of the Hessian, which keeps that of all widths together: they may rise where the gaps fall.
     """
     coordinates, end = search.coordinates, search.cost
-    common = {name: value for name, value in coordinates.items() if name in free - {"widths"}}
+    own = [name for name in INDIVIDUAL if name in free]
+    common = {name: value for name, value in coordinates.items() if name in free - set(INDIVIDUAL)}
     flat, restore = ravel_pytree(common)
 
     def difference(way: Coordinates) -> Coordinates:
@@ -253,21 +249,43 @@ def _posterior_spread(search: Search, problem: Problem, free: Set[str]) -> tuple
 
     columns = [difference(restore(unit)) for unit in jnp.eye(flat.size, dtype=flat.dtype)]
     hessian = np.stack([of_common(column) for column in columns])
-    if "widths" not in free:
+    if not own:
         covariance = np.linalg.inv(hessian)
         return restore(jnp.asarray(_root_of_diagonal(covariance))), jnp.asarray(covariance)
-    mixed = np.stack([np.asarray(column["widths"]) for column in columns])
-    widths = coordinates["widths"]
-    if widths.size <= _WHOLE:
-        columns_of_widths = [
-            difference({"widths": unit})["widths"] for unit in jnp.eye(widths.size, dtype=widths.dtype)
-        ]
-        curvature = np.stack([np.asarray(row) for row in columns_of_widths])
-    else:
-        curvature = np.diag(np.asarray(difference({"widths": jnp.ones_like(widths)})["widths"]))
+    mixed = np.stack([np.concatenate([np.asarray(column[name]) for name in own]) for column in columns])
+    curvature = _curvature_of_individuals(search, problem, difference, own)
     covariance = np.linalg.inv(np.block([[hessian, mixed], [mixed.T, curvature]]))
     sd, k = _root_of_diagonal(covariance), flat.size
-    return restore(jnp.asarray(sd[:k])) | {"widths": jnp.asarray(sd[k:])}, jnp.asarray(covariance[:k, :k])
+    individual = zip(own, np.split(sd[k:], len(own)), strict=True)
+    every = restore(jnp.asarray(sd[:k])) | {name: jnp.asarray(value) for name, value in individual}
+    return every, jnp.asarray(covariance[:k, :k])
+
+
+def _curvature_of_individuals(
+    search: Search, problem: Problem, difference: Callable[[Coordinates], Coordinates], own: list[str]
+) -> Float[np.ndarray, "o o"]:
+    """Hessian (o, o) of the cost in the individual coordinates `own`, each of which has a value for each participant,
+    one after the other, from `difference`, its product with a vector.
+
+    Of more than 32 participants each one's curvature in the width is the row sum of the Hessian, which keeps that of
+    all together: widths may rise where the gaps fall. With sensitivities the diagonals of all blocks are kept instead,
+    and the mean of the other elements.
+    """
+    like = search.coordinates[own[0]]
+    if like.size <= _WHOLE:
+        columns = [difference({name: unit}) for name in own for unit in jnp.eye(like.size, dtype=like.dtype)]
+        return np.stack([np.concatenate([np.asarray(column[name]) for name in own]) for column in columns])
+    together = {name: difference({name: jnp.ones_like(like)}) for name in own}
+    if "sensitivities" not in own:
+        return np.diag(np.asarray(together["widths"]["widths"]))
+
+    def block(name: str, other: str) -> Float[np.ndarray, "M M"]:
+        diagonal = (of_each[name][other] + of_each[other][name]) / 2
+        between = float(np.sum(np.asarray(together[name][other]) - diagonal)) / (like.size * (like.size - 1))
+        return np.diag(diagonal - between) + between
+
+    of_each = {name: diagonals(search, problem, name) for name in own}
+    return np.block([[block(name, other) for other in own] for name in own])
 
 
 def _root_of_diagonal(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, " k"]:

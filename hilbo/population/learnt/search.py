@@ -25,7 +25,7 @@ _MOVED = 0.35  # of log theta: features of other lengths leave more, but the RBF
 _REACH = 1.5  # of log theta, in one descent: where lengths grow far beyond it, features become singular
 # About the standard deviations that 600 answers leave: in these units a search is as wide in all directions.
 _UNITS = {"theta": 0.7, "shared": 0.5, "own": 0.4, "middle": 0.5, "gaps": 0.1, "widths": 0.3, "effect": 0.5}
-_UNITS |= {"sensitivity": 0.3}
+_UNITS |= {"sensitivities": 0.3, "spread": 0.3}
 
 
 class Search(NamedTuple):

@@ -14,7 +14,7 @@ In units of the classification noise, with d parameters and C categories, people
     log own variance                             0, 1                0, 2                0, 2
     middle of the thresholds                     0, 1.5              0, 4                0, 4
     log distance of neighbouring thresholds      log 0.8, 0.7        log 0.8, 2          log 0.8, 2
-    log width_j of a person, if C > 2            0, 0.4              the same            none
+    log width_j of a person, if C > 2            0, 0.4              the same            the same
     log sensitivity_j of a person                none                none                0, spread
     log spread of the sensitivities              none                none                log 0.3, 1
     log variance of a random effect, if any      0, 2                the same            the same
@@ -40,10 +40,11 @@ class Recipe(NamedTuple):
     kernel: Literal["rbf", "matern32"]
     """Of the function that people share, and of everybody's own part."""
     priors: dict[str, Prior]
-    """By the names of `posterior.Coordinates`; that of theta less log d. With "sensitivity" participants differ in
-    sensitivity about the highest threshold, whose spread is learnt; otherwise in the widths of middle categories."""
+    """By the names of `posterior.Coordinates`; that of theta less log d. With "spread" participants may differ in
+    sensitivity."""
     worth: float
-    """Gain of log evidence, in nats, from which participants differ in the use of the scale."""
+    """Smallest gain of log evidence, in nats, for individual widths, and for sensitivities about the middle of the
+    thresholds instead of the highest one."""
 
 
 WIDTHS: Final = Prior(0.0, 0.4)
@@ -79,4 +80,4 @@ LEARNT_2: Final = Recipe(
     },
     3.0,
 )
-LEARNT_3: Final = Recipe("learnt-3", "matern32", LEARNT_2.priors | {"sensitivity": Prior(math.log(0.3), 1.0)}, 0.0)
+LEARNT_3: Final = LEARNT_2._replace(name="learnt-3", priors=LEARNT_2.priors | {"spread": Prior(math.log(0.3), 1.0)})

@@ -36,7 +36,7 @@ from hilbo.kernels import gram
 from hilbo.numerics.sharding import of_each_person, sharded
 from hilbo.population.shared.features import Pivots, features_of
 from hilbo.population.shared.people_model import PeopleModel
-from hilbo.population.shared.scale_use import with_factor
+from hilbo.population.shared.scale_use import of_person
 from hilbo.population.shared.tallies import Expansion, Tallies, expand_counts
 
 __all__ = [
@@ -145,15 +145,15 @@ def _expand(model: PeopleModel, answers: Tallies, eta: Float[Array, "M n"]) -> E
     n).
     """
 
-    sensitivity = model.sensitivity
-
-    def each(some, likelihood):
-        def person(log_factor, counts, eta):
-            return jax.vmap(partial(expand_counts, with_factor(likelihood, log_factor, sensitivity)))(eta, counts)
+    def each(some, likelihood, fixed_point):
+        def person(log_width, log_sensitivity, counts, eta):
+            own = of_person(likelihood, log_width, log_sensitivity, fixed_point)
+            return jax.vmap(partial(expand_counts, own))(eta, counts)
 
         return jax.vmap(person)(*some)
 
-    return of_each_person(each, (model.log_widths, answers.counts, eta), model.likelihood)
+    people = model.log_widths, model.log_sensitivities, answers.counts, eta
+    return of_each_person(each, people, model.likelihood, model.fixed_point)
 
 
 # --- the mode

@@ -16,8 +16,7 @@ __all__ = ["PeopleModel"]
 
 class PeopleModel(eqx.Module):
     """Hyperparameters of the hierarchical model of M participants: kernel and its theta, prior variances of the shared
-    and of the individual functions, thresholds, noise, and each participant's log factor in the
-    use of the scale (`scale_use`).
+    and of the individual functions, thresholds, noise, and each participant's use of the scale.
     """
 
     theta: Float[Array, "*d"]
@@ -29,15 +28,18 @@ class PeopleModel(eqx.Module):
     thresholds: Float[Array, " edges"]
     noise: Float[Array, ""]
     log_widths: Float[Array, " M"]
-    """Logarithm of each person's factor, as `with_factor` takes it."""
+    """Logarithm of each person's width (`scale_use`)."""
     kernel: type[Stationary] = eqx.field(static=True, default=RBF)
     """Of g and of each h_j."""
     levels: tuple[int, ...] = eqx.field(static=True, default=())
     """For each coordinate its number of unordered levels, as kernels take it."""
     effect: Float[Array, ""] | None = None
     """Prior variance of what each context adds to everybody's function; None without a random effect."""
-    sensitivity: bool = eqx.field(static=True, default=False)
-    """Whether the factors are those of sensitivities about the highest threshold; otherwise of widths (`scale_use`)."""
+    log_sensitivities: Float[Array, " M"] | None = None
+    """Logarithm of each person's sensitivity (`scale_use`); None: all participants have the same one."""
+    fixed_point: Float[Array, ""] | None = None
+    """Latent value that a sensitivity leaves unchanged, as a position between the mean of the thresholds, 0, and the
+    highest one, 1; None is 1."""
 
     @classmethod
     def of(cls, gp: OrdinalGP, share: ArrayLike, people: int) -> "PeopleModel":
@@ -63,7 +65,7 @@ class PeopleModel(eqx.Module):
 
     @property
     def likelihood(self) -> OrdinalProbit:
-        """Likelihood of the median participant, whose factor is 1."""
+        """Likelihood of the median participant, whose width and sensitivity are 1."""
         return OrdinalProbit(self.thresholds, self.noise)
 
     @property

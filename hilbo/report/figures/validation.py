@@ -64,7 +64,7 @@ def _widest(rows):
     people = rows[rows["errors"].str.startswith("exact, of")]
     if len(people):
         return people.loc[(people["high"] - people["low"]).idxmax()]
-    plain = rows[(rows["errors"] == "Wilson") | rows["errors"].str.startswith("clustered")]
+    plain = rows[(rows["errors"] == "Wilson") | rows["errors"].str.startswith(("clustered", "jackknife"))]
     return plain.loc[(plain["high"] - plain["low"]).fillna(-1.0).idxmax()]
 
 

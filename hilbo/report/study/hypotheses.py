@@ -2,7 +2,8 @@
 
 Every item is a sentence with its numbers, and whether it supports the hypothesis, contradicts it, or is inconclusive.
 The bounds are stated in the sentence; a tie with the bound is inconclusive, so that a verdict does not depend on the
-direction of a scale. A difference between participants is inconclusive if its 95 % interval contains 0. Items are not
+direction of a scale. A difference between participants is inconclusive if its 95 % interval contains 0,
+or if it is equal for all of them. Items are not
 counted, and none is a test of its own. Only a study that asks for it has this
 section (`[report] hypotheses = true`): the hypotheses are the paper's.
 
@@ -93,14 +94,16 @@ class _Difference(NamedTuple):
 
     def __str__(self) -> str:
         if not np.isfinite(self.low):
-            return f"{self.mean:.1f} %"
+            return f"{self.mean:.1f} % (no interval: fewer than two participants, or all equal)"
         return f"{self.mean:.1f} % (95 % interval {self.low:.1f} to {self.high:.1f})"
 
 
 def _difference(values: np.ndarray) -> _Difference:
-    """Mean of differences (M,) of as many participants; the interval of fewer than two is unbounded."""
+    """Mean of differences (M,) of as many participants; the interval of fewer than two is unbounded, and so is that of
+    equal differences, which have no spread to estimate it from.
+    """
     mean = float(values.mean()) if len(values) else np.nan
-    if len(values) < 2:
+    if len(values) < 2 or np.ptp(values) <= _SAME * np.abs(values).max():
         return _Difference(mean, -np.inf, np.inf)
     half = float(t.ppf(0.975, len(values) - 1) * values.std(ddof=1)) / len(values) ** 0.5
     return _Difference(mean, mean - half, mean + half)

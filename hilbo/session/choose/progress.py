@@ -1,10 +1,8 @@
 """Progress of a session for the experimenter, who may stop earlier or continue; nothing stops by itself.
 
-`trust` describes how well an optimisation has located the participant's best rendering:
-
-- the probability that the current best rendering is rated in the highest category,
-- how far the best rendering is expected to move after one more answer: the mean over the predicted answers to the next
-  rendering of the NRMSE (fraction of the search ranges) between the two best renderings.
+`trust` describes how well an optimisation has located the participant's best rendering, by how far that is expected to
+move after one more answer: the mean over the predicted answers to the next rendering of the NRMSE (fraction of the
+search ranges) between the two best renderings.
 
 `consistency` compares repeated trials; `hilbo.app.pages.pace` is about the time. The default stays the paper's fixed
 number of trials.
@@ -33,8 +31,6 @@ class Trust:
     is."""
 
     best: dict[str, float]
-    top: float
-    """Probability that the best rendering is answered with the highest category."""
     movement: float | None
     """Expected movement of the best with one more answer, NRMSE; None where no rendering comes next."""
 
@@ -63,13 +59,12 @@ def trust(
     """
     study = chooser.study(block)
     bests = np.stack([chooser.best(block, one) for one in (fitted, *following)])
-    next_one = bests[0] if upcoming is None else upcoming
-    top, chances = np.asarray(_chances(study, fitted.posterior, np.stack([bests[0], next_one])))
     movement = None
     if upcoming is not None:
+        chances = np.asarray(_chances(study, fitted.posterior, upcoming[None, :]))[0]
         units = np.asarray(_units(study, bests))
         movement = float(chances @ np.asarray(nrmse(units[1:], units[0], study.gp.kernel.levels)))
-    return Trust(Rendering.of(study.space, bests[0]).values, float(top[-1]), movement)
+    return Trust(Rendering.of(study.space, bests[0]).values, movement)
 
 
 @program

@@ -35,7 +35,7 @@ LEARNABLE = ("theta", "noise", "thresholds")
 """Hyperparameters that are optimised. The prior variance is kept: it fixes the scale of the latent function."""
 _COORDINATES = {"shared": "shared variance", "own": "individual variance", "middle": "thresholds", "gaps": "thresholds"}
 _COORDINATES |= {"widths": "individual use of the scale", "effect": "random effect"}
-_COORDINATES |= {"sensitivity": "individual use of the scale"}
+_COORDINATES |= {"sensitivities": "individual use of the scale", "spread": "individual use of the scale"}
 
 
 class FixedAndOptimised(NamedTuple):

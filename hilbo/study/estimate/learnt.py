@@ -14,12 +14,13 @@ from hilbo.population.learnt.rule import Learnt
 from hilbo.population.learnt.sample import learn_from_sample
 from hilbo.population.maps import RuleMap
 from hilbo.population.rules.registry import RECIPES, RECOMMENDED, RULES, WITHDRAWN
+from hilbo.population.shared.scale_use import INDIVIDUAL
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 
 __all__ = ["by_rule", "effect_content", "learnt_content", "learnt_sentences", "resolved", "that_learns"]
 
-_LABELS = {"effect": "random effect", "sensitivity": "spread of sensitivities"}
+_LABELS = {"effect": "random effect", "spread": "spread of sensitivities"}
 _UNKNOWN = 0.9  # of the prior's standard deviation: the answers hardly say more
 
 
@@ -80,13 +81,18 @@ def learnt_content(study: Study, names: Sequence[str], map_: RuleMap) -> dict[st
     }
     content["intervals"] = {name: list(ends) for name, ends, _ in _coordinates(study, learnt)}
     content["not_identified"] = [name for name, _, known in _coordinates(study, learnt) if not known]
-    if learnt.scale is not None:
-        kind, sign = ("sensitivity", -1) if learnt.scale.sensitivity else ("width", 1)
-        logs, sd = sign * np.asarray(learnt.coordinates["widths"]), np.asarray(learnt.sd["widths"])
-        ends = np.exp(np.stack([logs, logs - 1.96 * sd, logs + 1.96 * sd], axis=1)).tolist()
-        content["sensitivities" if learnt.scale.sensitivity else "widths"] = {
-            name: {kind: value, "interval": [low, high]} for name, (value, low, high) in zip(names, ends, strict=True)
-        }
+    if model.fixed_point is not None:
+        content["sensitivities_about"] = (
+            "the highest threshold" if model.fixed_point == 1.0 else "the middle of the thresholds"
+        )
+    for kind, key in (("width", "widths"), ("sensitivity", "sensitivities")):
+        if key in learnt.coordinates:
+            logs, sd = np.asarray(learnt.coordinates[key]), np.asarray(learnt.sd[key])
+            ends = np.exp(np.stack([logs, logs - 1.96 * sd, logs + 1.96 * sd], axis=1)).tolist()
+            content[key] = {
+                name: {kind: value, "interval": [low, high]}
+                for name, (value, low, high) in zip(names, ends, strict=True)
+            }
     return content
 
 
@@ -110,10 +116,11 @@ def effect_content(study: Study, cohort: Cohort, map_: RuleMap) -> dict[str, Any
 
 def _coordinates(study: Study, learnt: Learnt) -> list[tuple[str, tuple[float, float], bool]]:
     """A row per learnt hyperparameter: name, 95 % interval, and whether it is identified (posterior sd below 0.9 of the
-    prior's). Threshold distances and variances are in units of the noise; per-participant widths are left out."""
+    prior's). Threshold distances and variances are in units of the noise; individual widths and sensitivities are left
+    out."""
     rows = []
     for name, value in learnt.coordinates.items():
-        if name == "widths":
+        if name in INDIVIDUAL:
             continue
         means, sds = np.atleast_1d(np.asarray(value)), np.atleast_1d(np.asarray(learnt.sd[name]))
         labels = [f"theta.{p}" for p in study.space.names] if name == "theta" else [name]
