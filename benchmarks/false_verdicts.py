@@ -1,4 +1,4 @@
-"""How often is a hypothesis supported or contradicted by a difference between participants that does not exist?
+"""False-positive rates of the verdicts on hypotheses, for differences between participants with expectation 0.
 
     python benchmarks/false_verdicts.py [--studies 20000] [--write]
 

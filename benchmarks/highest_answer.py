@@ -4,9 +4,9 @@
     python benchmarks/highest_answer.py FILE --write
 
 FILE (JSON Lines) collects a row for each study; a run that was stopped goes on where it was. What has been run is in
-benchmarks/highest_answer.jsonl. All rules have the same answers. learnt-3 was chosen on the presets paper-01,
-paper-04, ... paper-28, seeds 0 to 2; what is reported is of paper-02, paper-05, ... paper-29 and of the other
-populations, seeds from 1000. --write puts the table into docs/methods/which_method.md.
+benchmarks/highest_answer.jsonl. All methods have the same responses. learnt-3 was chosen on the presets
+paper-01, paper-04, ... paper-28, seeds 0 to 2; reported are paper-02, paper-05, ... paper-29 and the other populations,
+seeds from 1000. --write puts the table into docs/methods/which_method.md.
 """
 
 import argparse
@@ -59,11 +59,13 @@ def main():
                 row = {"population": name, "design": chosen.design, "seed": seed}
                 rows.add(rounded(row | {"by": one_study(name, chosen.design, seed)}))
                 by = rows.rows[-1]["by"].items()
-                print(name, seed, {k: [v["regret"], v["promise"] - v["true"], v.get("low")] for k, v in by}, flush=True)
+                print(
+                    name, seed, {k: [v["regret"], v["predicted"] - v["true"], v.get("low")] for k, v in by}, flush=True
+                )
 
 
 def one_study(name, design, seed):
-    """By rule: regret, promised and true probability of the highest answer at the optimum and elsewhere."""
+    """By method: regret, and predicted and true probability of the highest response at the optimum and elsewhere."""
     population = POPULATIONS[name] if name in POPULATIONS else PAPER[name]
     people, trials = map(int, design.split("x"))
     study = with_trials(population.study, trials)
@@ -90,7 +92,7 @@ def by_rule(study, cohort, rule, candidates, chance, best, places, seed):
         return np.asarray(map_.class_probabilities(likelihood, x))[:, -1]
 
     true = float(chance_at(chance, optimum[None, :])[0])
-    row = {"regret": best - true, "promise": float(said(optimum[None, :])[0]), "true": true}
+    row = {"regret": best - true, "predicted": float(said(optimum[None, :])[0]), "true": true}
     if RULES[rule].learns:
         drawn = hyperparameter_draws(study, cohort.trials, seed)
         highest = with_interval(study.gp.likelihood, map_, optimum, drawn)
@@ -113,7 +115,7 @@ def by_rule(study, cohort, rule, candidates, chance, best, places, seed):
 def table(rows):
     """Lines of the table: by group of populations and rule."""
     head = "populations", "rule", "studies", "bias at the optimum", "coverage of 95 % intervals"
-    yield f"| {' | '.join(head)} | bias at tested, untested points | regret | less learnt-2 |"
+    yield f"| {' | '.join(head)} | bias at tested, untested points | regret | regret minus learnt-2's |"
     yield "|---|---|---:|---:|---:|---:|---:|---:|"
     groups = {
         "`paper-02`, `paper-05`, … `paper-29`": lambda name: name in PAPER,
@@ -130,7 +132,7 @@ def table(rows):
 
 def cells(said, others):
     """Cells of a row of the table: `said` by a rule in each study, `others` by learnt-2."""
-    bias = [each["promise"] - each["true"] for each in said]
+    bias = [each["predicted"] - each["true"] for each in said]
     yield f"{mean_and_error(bias)}"
     held = [each["low"] <= each["true"] <= each["high"] for each in said if "low" in each]
     yield f"{100 * np.mean(held):.0f} %" if len(held) == len(said) else "–"

@@ -1,13 +1,13 @@
-"""Real people who are left out: log predictive density, and calibration of P(highest answer).
+"""Cross-validation on real data: log predictive density, and calibration of P(highest response).
 
     python benchmarks/left_out_people.py FILE DATA [--only orientation speed video touch]
     python benchmarks/left_out_people.py FILE --write
 
 DATA: the folder with orientation_confidence.csv, tactile_speed.csv, video_quality.csv and touch_video.csv. FILE (JSON
-Lines) collects a row for each fold; a run that was stopped goes on. Each person is left out alone, those of touch_video
-in 8 groups. Answers are predicted from the others' alone. bcm has the kernel, thresholds and noise of learnt-2. Errors
-are clustered by person. --write puts the table into docs/methods/which_method.md; what has been run is in
-benchmarks/left_out_people.jsonl.
+Lines) collects a row for each fold; an interrupted run resumes. touch_video has 8 folds, the others one for each
+participant. Predictions do not use the participant's own responses. bcm has the kernel, thresholds and noise of
+learnt-2. Errors are clustered by participant. --write puts the table into docs/methods/which_method.md; the rows of all
+folds are in benchmarks/left_out_people.jsonl.
 """
 
 import argparse
@@ -95,7 +95,10 @@ READ = {
 
 
 def one_fold(data, levels, left):
-    """Gains of log evidence by individual factors, and the predictions of `people`. `left` (M,): who is left out."""
+    """Gains of log evidence by individual factors, and the predictions of `people`.
+
+    `left` (M,): mask of the participants left out.
+    """
     test = left[data.who]
     trials = rows_of(data.trials(~test), np.flatnonzero(~left))
     x, place = np.unique(data.x[test], axis=0, return_inverse=True)
@@ -112,7 +115,7 @@ def one_fold(data, levels, left):
 
 
 def by_committee(gp, data, left, x):
-    """Class probabilities (m, C) by bcm at points x (m, d), from everybody but those who are `left` (M,) out."""
+    """Class probabilities (m, C) by bcm at points x (m, d), fitted without the participants in the mask `left` (M,)."""
     kept = np.flatnonzero(~left)
     means, explained = jax.vmap(lambda one: one.predict_explained(x))(each(gp, rows_of(data.counts, kept)))
     moments = aggregate("bcm", means, explained, gp.kernel.variance)
@@ -120,8 +123,9 @@ def by_committee(gp, data, left, x):
 
 
 def people(data, test, chances):
-    """For each person who was left out: number of answers, and by rule the sum of log densities and of P(highest) less
-    the number of highest answers."""
+    """For each participant left out: number of responses, and by method the sum of log densities, and the predicted
+    minus the observed number of highest responses.
+    """
     q, who = data.q[test], data.who[test]
     content = []
     for person in np.unique(who):
@@ -135,7 +139,7 @@ def people(data, test, chances):
 
 
 def table(rows):
-    yield "| people | rule | log density minus learnt-2's | P(highest), predicted minus observed | evidence |"
+    yield "| data | method | log density minus learnt-2's | P(highest), predicted minus observed | evidence |"
     yield "|---|---|---:|---:|---|"
     for name, words in WORDS.items():
         folds = [row for row in rows if row["data"] == name]

@@ -3,8 +3,8 @@
 `validate` computes one material; `write_validation` makes the folder of `hilbo validate` with one section for each
 material: result.json, the tables as CSV, the figures, and one page. `hilbo report` uses the same parts.
 
-Of every coefficient the page shows the widest interval, which docs/methods/statistics.md
-finds the safest; all kinds of error are in the CSV tables.
+The page shows the widest interval of each coefficient, the safest by docs/methods/statistics.md; all kinds of
+error are in the CSV tables.
 """
 
 import itertools

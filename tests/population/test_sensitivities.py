@@ -59,7 +59,7 @@ def test_the_cost_has_the_integral_over_sensitivities():
     start = medians(answers, NOTHING, LEARNT_3.priors, KERNELS[LEARNT_3.kernel])
     common = frozenset(start) - {"widths"}
     search, problem = searched(*first_search(start, answers, NOTHING, LEARNT_3), common)
-    search, problem = _with_sensitivities(search, problem)
+    search, problem = _with_sensitivities(search, problem, 1.0)
     sd = float(np.exp(search.coordinates["spread"]))
     nodes, weights = np.polynomial.hermite_e.hermegauss(24)
 

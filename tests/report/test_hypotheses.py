@@ -44,7 +44,7 @@ def test_a_tie_of_answers_says_nothing_whichever_way_the_scale_runs(counts, side
 def test_equal_shares_half_of_the_people_and_differences_without_a_spread_say_nothing(
     first, last, sixth, chances, sides
 ):
-    """Six people, of whom five answer alike: in the first two trials, in two between, and in the last two."""
+    """Six participants with six trials each; five of them respond identically."""
     answers = np.array([[*first, 1, 1, *last]] * 5 + [[*sixth[:2], 1, 1, *sixth[2:]]])
     trials = SimpleNamespace(q=answers, mask=np.ones((6, 6), bool))
     cohort = SimpleNamespace(names=tuple("ABCDEF"), trials=trials, counts=lambda: np.full(6, 6))

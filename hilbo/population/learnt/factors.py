@@ -32,7 +32,7 @@ class Chosen(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """By all factors that are in the model."""
+        """Gain of log evidence by all factors in the model, in nats."""
         return sum(gain for name, gain in self.gains.items() if name in self.free)
 
 
@@ -40,8 +40,8 @@ def with_factors_if_worth(alike: Search, problem: Problem, recipe: Recipe) -> Ch
     """Continue the search `alike`, in which participants use the scale alike, with individual factors.
 
     Sensitivities come first, about the highest threshold, then widths. With fewer than four categories these are not
-    tried beside sensitivities. With more, all is done again with sensitivities about the middle of the thresholds,
-    which is chosen if the log evidence is larger by more than the recipe's `worth`.
+    tried in addition to sensitivities. With more, the model is also fitted with sensitivities about the middle of the
+    thresholds, which is chosen if the log evidence is larger by more than the recipe's `worth`.
     """
     if "spread" not in recipe.priors:
         return _with_widths_if_worth(_without(alike, problem), recipe)
@@ -57,6 +57,7 @@ def with_factors_if_worth(alike: Search, problem: Problem, recipe: Recipe) -> Ch
 
 
 def _without(alike: Search, problem: Problem) -> Chosen:
+    """The search without individual factors."""
     return Chosen(alike, problem, frozenset(alike.coordinates) - {"widths"}, {})
 
 
@@ -102,7 +103,7 @@ def _with_features_of(other: Problem, chosen: Chosen) -> Search:
     return search._replace(cost=cost_at(search.coordinates, search.cost.weights, problem))
 
 
-def _with_sensitivities(alike: Search, problem: Problem, fixed_point: float = 1.0) -> tuple[Search, Problem]:
+def _with_sensitivities(alike: Search, problem: Problem, fixed_point: float) -> tuple[Search, Problem]:
     """Continue the search `alike` with individual sensitivities, whose spread is learnt too: twice, by Laplace factors
     at its start and at its first end. The cost of the result has the factors of its own end.
     """
@@ -127,7 +128,7 @@ def _with_sensitivities(alike: Search, problem: Problem, fixed_point: float = 1.
 
 def _with_information(search: Search, problem: Problem) -> tuple[Problem, Search]:
     """The problem with the curvatures at the coordinates of `search` for its Laplace factors, and the search with the
-    cost by these. A participant for whom the curvature is negative has 0: nothing is known of that sensitivity.
+    cost by these. Negative curvatures become 0: such responses do not constrain the sensitivity.
     """
     of_cost = diagonals(search, problem, "sensitivities")["sensitivities"]
     information = np.maximum(of_cost - np.exp(-2 * float(search.coordinates["spread"])), 0.0)

@@ -52,7 +52,7 @@ __all__ = [
 _ROUGH = 0.05
 _AT_A_TIME = 2  # draws: much of their arithmetic is of one core
 _MOST_FEATURES, _NUMBERS = 1024, 64_000_000  # of the shared function; of all people's features, half a gigabyte
-_WHOLE = 32  # people, up to whom the curvature in all individual coordinates is made: a gradient or two each
+_WHOLE = 32  # most participants with a full Hessian of the individual coordinates: one or two gradients each
 
 
 class Learnt(eqx.Module):
