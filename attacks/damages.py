@@ -237,7 +237,8 @@ def _result(path: Path, study: Study) -> Path:
         {"participant": name, "trials": 25, "optimum": optimum, "certificate": {"converged": True}}
         for name, optimum in zip(PEOPLE, optima[1:], strict=True)
     ]
-    content = {"optimum": optima[0], "participants": people, "study": study.file.hash, "seed": 0, "warnings": []}
+    about = {"study": study.file.hash, "meaning": study.file.meaning, "goal": study.goal_label, "seed": 0}
+    content = {"optimum": optima[0], "participants": people, **about, "warnings": []}
     path.write_text("".join(sealed(json_lines(content))), encoding="utf-8")
     return path
 

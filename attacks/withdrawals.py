@@ -172,7 +172,7 @@ def _quick_validation(folder: Path) -> None:
 
     from hilbo.simulation.presets import PRESETS
     from hilbo.simulation.validation_sessions import sets_table, validation_table
-    from hilbo.study.analysis.tolerance import Sets
+    from hilbo.study.analysis.best_mid_worst import Sets
     from hilbo.study.config import Study
 
     study = Study.load(folder / "study.toml")

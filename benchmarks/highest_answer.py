@@ -95,7 +95,7 @@ def by_rule(study, cohort, rule, candidates, chance, best, places, seed):
     row = {"regret": best - true, "predicted": float(said(optimum[None, :])[0]), "true": true}
     if RULES[rule].learns:
         drawn = hyperparameter_draws(study, cohort.trials, seed)
-        highest = with_interval(study.gp.likelihood, map_, optimum, drawn)
+        highest = with_interval(study.gp.likelihood, study.goal, map_, optimum, drawn)
         row |= {"low": highest.low, "high": highest.high}
     for where, x in zip(("tested", "untested"), places, strict=True):
         gap = said(x) - np.asarray(chance_at(chance, x))

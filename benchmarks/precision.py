@@ -166,7 +166,9 @@ def choices() -> Iterator[Row]:
         yield Row(f"acquisition.{name}: value", apart(low, high), 1e-3, "prior sd, or log")
         loss = float(np.max(high) - high[np.argmax(low)])
         yield Row(f"acquisition.{name}: loss of the chosen candidate", loss, 1e-4, "prior sd, or log")
-    best = [best_point(study.space, posterior.astype(np.float64), candidates).x for posterior, _ in by_dtype]
+    best = [
+        best_point(study.goal, study.space, posterior.astype(np.float64), candidates).x for posterior, _ in by_dtype
+    ]
     yield Row("best_point, from a posterior fitted in float32", apart(best[1], best[0]), 1e-2, "of the search range")
 
 

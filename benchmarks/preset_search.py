@@ -25,11 +25,10 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from rows import Rows  # noqa: E402
 
-from hilbo.errors import InputError  # noqa: E402
 from hilbo.population.maps import rule_map  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import Population, people, simulate_study  # noqa: E402
-from hilbo.study.analysis.tolerance import best_mid_worst  # noqa: E402
+from hilbo.study.analysis.best_mid_worst import best_mid_worst  # noqa: E402
 from hilbo.study.cohort import Cohort  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
 from hilbo.study.estimate.aggregate import fit_cohort  # noqa: E402
@@ -196,11 +195,11 @@ def one_study(population, seed, number):
     candidates = jnp.asarray(search_points(STUDY.space, 0))
     posteriors = fit_cohort(STUDY, cohort)
     came = individuals(STUDY, trials, np.asarray(individual_optima(STUDY, posteriors, candidates).x))
-    try:
-        rule = rule_map(STUDY.gp, trials, "bcm", posteriors=posteriors)
-        sets = np.asarray(best_mid_worst(STUDY, rule.predict, candidates).x)
-    except InputError:
+    rule = rule_map(STUDY.gp, trials, "bcm", posteriors=posteriors)
+    three = best_mid_worst(STUDY, rule.predict, candidates)
+    if three.second_choice:
         return came | {"classes": None}
+    sets = np.asarray(three.x)
     came["error"] = float(100 * np.sqrt(np.mean((sets[0] - truth_of(STUDY)) ** 2)))
     return came | validation(population, sets, start)
 

@@ -23,13 +23,13 @@ import numpy as np  # noqa: E402
 from preset_search import CROWD, STUDY, distance, individuals, truth_of, validation  # noqa: E402
 from rows import Rows  # noqa: E402
 
-from hilbo.errors import InputError  # noqa: E402
 from hilbo.population.maps import learnt_map, rule_map  # noqa: E402
 from hilbo.population.rules.registry import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.presets import PRESETS  # noqa: E402
 from hilbo.simulation.simulate import people, simulate_study  # noqa: E402
-from hilbo.study.analysis.tolerance import best_mid_worst, slice_through  # noqa: E402
+from hilbo.study.analysis.best_mid_worst import best_mid_worst  # noqa: E402
+from hilbo.study.analysis.tolerance import slice_through  # noqa: E402
 from hilbo.study.cohort import Cohort  # noqa: E402
 from hilbo.study.estimate.aggregate import fit_cohort  # noqa: E402
 from hilbo.study.estimate.learnt import resolved, that_learns  # noqa: E402
@@ -82,12 +82,11 @@ def one_study(population, seed):
             "preferred to individuals": preferred(population, crowd, x, own, seed),
             "intervals": intervals(study, map_, x),
         }
-        try:
-            sets = np.asarray(best_mid_worst(study, map_.predict, candidates, prior=map_.map_prior).x)
-        except InputError:
+        sets = best_mid_worst(study, map_.predict, candidates, prior=map_.map_prior)
+        if sets.second_choice:
             rules[rule] |= {"classes": None, "preferred": None}
-            continue
-        rules[rule] |= validation(population, sets, seed)
+        else:
+            rules[rule] |= validation(population, np.asarray(sets.x), seed)
     return {"individuals": individuals(STUDY, trials, own), "rules": rules}
 
 

@@ -8,6 +8,10 @@ is then refined by Newton's method in the optimiser's coordinates, in which the 
     top category:                log P(highest response) = log Phi((mu - t) / sqrt(noise^2 + sigma^2))
     Thompson:                    the maximum of one draw of f over the candidates
 
+For a goal other than the highest response, UCB, log expected improvement and Thompson's draw use the closeness to it
+(`Goal`) in place of mu or f. Between other responses UCB is then the straddle criterion of Bryan et al. (2005), NIPS
+18:163.
+
 Log expected improvement after Ament et al. (2023), arXiv:2310.20708: without the logarithm it is 0, and flat, wherever
 an improvement is unlikely.
 """
@@ -20,11 +24,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from hilbo.likelihoods import Goal, OrdinalProbit
 from hilbo.numerics.climbing import Choice, climb, spread
 from hilbo.numerics.linalg import eigh
 from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
 
-__all__ = ["UCB", "LogEI", "Score", "TopCategory", "maximise", "thompson"]
+__all__ = ["UCB", "InCategory", "LogEI", "Score", "TopCategory", "TowardsGoal", "maximise", "thompson"]
 
 
 def __dir__() -> list[str]:
@@ -100,6 +105,50 @@ class TopCategory(eqx.Module):
         Reached with variance 0 where the mean is above the threshold, and with the `prior` variance below it.
         """
         return self(mean, jnp.where(mean > self.threshold.astype(mean.dtype), 0.0, prior))
+
+
+class TowardsGoal(eqx.Module):
+    """A score that takes the closeness of the mean to the `goal`, by the thresholds of `likelihood`, for the mean."""
+
+    score: UCB | LogEI
+    goal: Goal = eqx.field(static=True)
+    likelihood: OrdinalProbit
+
+    def __call__(self, mean, variance):
+        """Score of posterior `mean` and `variance`, arrays of one shape, which is also the result's."""
+        return self.score(self.goal.closeness(self.likelihood, mean), variance)
+
+    def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
+        """Upper bound of the score given the posterior mean, for every variance up to the `prior` variance; mean's
+        shape.
+        """
+        return self.score.optimistic(self.goal.closeness(self.likelihood, mean), prior)
+
+
+class InCategory(eqx.Module):
+    """Log probability that the response is in a `category` of the `likelihood`."""
+
+    likelihood: OrdinalProbit
+    category: int = eqx.field(static=True)
+
+    def __call__(self, mean, variance):
+        """Score of posterior `mean` and `variance`, arrays of one shape, which is also the result's."""
+        log_mass = jnp.vectorize(lambda m, v: self.likelihood.smoothed(m, v, self.category)[0])
+        return log_mass(mean, variance)
+
+    def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
+        """Upper bound of the score given the posterior mean, for every variance up to the `prior` variance; mean's
+        shape.
+
+        Within the category the bound is reached with variance 0; outside, it is the log probability of all latent
+        values beyond the category's nearer threshold, by the `prior` variance.
+        """
+        inf = jnp.full(1, jnp.inf, mean.dtype)
+        edges = jnp.concatenate([-inf, self.likelihood.thresholds.astype(mean.dtype), inf])
+        lower, upper = edges[self.category], edges[self.category + 1]
+        spread = jnp.sqrt(self.likelihood.noise.astype(mean.dtype) ** 2 + prior)
+        beyond = jax.scipy.special.log_ndtr(jnp.minimum(mean - lower, upper - mean) / spread)
+        return jnp.where((lower < mean) & (mean < upper), self(mean, jnp.zeros_like(mean)), beyond)
 
 
 def _log_improvement(z: Float[Array, "*m"]) -> Float[Array, "*m"]:

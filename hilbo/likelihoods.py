@@ -11,6 +11,7 @@ Ghahramani (2005), JMLR 6:1019.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,7 +25,7 @@ from hilbo.numerics.shown import check_positive, concrete, float_dtype, floats, 
 from hilbo.numerics.tracing import traced_once
 from hilbo.numerics.truncated_normal import truncated_normal
 
-__all__ = ["OrdinalProbit", "OrdinalTerms", "TiltedTerms"]
+__all__ = ["Goal", "OrdinalProbit", "OrdinalTerms", "TiltedTerms"]
 
 
 def __dir__() -> list[str]:
@@ -181,3 +182,60 @@ class TiltedTerms(eqx.Module):
         smoothed = jax.vmap(self.likelihood.smoothed)(mean, variance, self.q)
         value, slope, precision = (jnp.where(self.mask, term, jnp.zeros_like(term)) for term in smoothed)
         return value, slope, precision
+
+
+class Goal(NamedTuple):
+    """The response that a study searches for: index `category` (from 0) of `categories` responses.
+
+    The probit likelihood makes a response between others likeliest in the middle of its two thresholds, and less likely
+    the farther the latent value is from there, to both sides alike. With the closeness u to the goal,
+
+        highest response:  u(f) = f
+        lowest response:   u(f) = -f
+        between:           u(f) = -|f - m|,   m the middle of the response's thresholds
+
+    P(goal | f) rises with u(f) whatever the noise is.
+    """
+
+    category: int
+    categories: int
+
+    @classmethod
+    def highest(cls, categories: int) -> "Goal":
+        """The highest of `categories` responses."""
+        return cls(categories - 1, categories)
+
+    @classmethod
+    def of(cls, responses: Sequence[str], label: str = "") -> "Goal":
+        """The response with this label, one of `responses` (lowest first); without a label the highest."""
+        return cls(responses.index(label), len(responses)) if label else cls.highest(len(responses))
+
+    @property
+    def is_highest(self) -> bool:
+        """Whether the goal is the highest response."""
+        return self.category == self.categories - 1
+
+    @property
+    def is_between(self) -> bool:
+        """Whether responses both below and above the goal exist."""
+        return 0 < self.category < self.categories - 1
+
+    def sentence(self, label: str) -> str:
+        """What the goal, with this label, means for the optimum: one sentence; empty for the highest response."""
+        if self.is_highest:
+            return ""
+        if not self.is_between:
+            return f'The goal is "{label}", the lowest response: the lower the latent score is, the better.'
+        return (
+            f'The goal is "{label}", between other responses: the nearer the latent score is to the middle of its two'
+            " thresholds, the better."
+        )
+
+    def closeness(self, likelihood: OrdinalProbit, f: Float[Array, "*m"]) -> Float[Array, "*m"]:
+        """Closeness u(f) of latent values to the goal, in their unit, of their shape and dtype."""
+        if self.is_highest:
+            return f
+        if not self.is_between:
+            return -f
+        lower, upper = likelihood.thresholds[self.category - 1], likelihood.thresholds[self.category]
+        return -jnp.abs(f - ((lower + upper) / 2).astype(f.dtype))

@@ -13,7 +13,6 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-import matplotlib.pyplot as plt  # noqa: F401  (in a notebook, it shows figures below their cells)
 import numpy as np
 
 import hilbo

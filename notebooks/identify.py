@@ -20,6 +20,7 @@ from hilbo.identification.characterise import characterise
 from hilbo.identification.fitting import fit, nrmse
 from hilbo.identification.material_tables import read_material
 from hilbo.identification.sampled import Sampled
+from hilbo.report.figures.mechanics import curves_figure
 from hilbo.report.material import renderer_block
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
@@ -47,6 +48,12 @@ print("NRMSE", {kind: f"{100 * value:.2f} %" for kind, value in nrmse(fitted).it
 result = characterise(material.tests, Sampled(N=101))
 for name, estimate in result.estimates.items():
     print(f"{name:7s} {estimate.value:8.4f}  {estimate.lower:8.4f} to {estimate.upper:8.4f}  {estimate.status}")
+
+# %% [markdown]
+# The tests, the fit, and what is left of them.
+
+# %%
+curves_figure(material.tests, result)
 
 # %% [markdown]
 # ## How much memory

@@ -17,13 +17,17 @@ import hilbo
 from hilbo.app.pages.session_views import participant_view
 from hilbo.app.rehearsal.rehearsal import Decider
 from hilbo.hardware_bridge import Renderer
+from hilbo.report.figures.maps import map_slices
 from hilbo.session.choose.look_ahead import LiveChooser
+from hilbo.session.export.tables import read_log_trials
 from hilbo.session.log.actions import answer, go_on, present, propose, sent
 from hilbo.session.log.event_log import EventLog
 from hilbo.session.log.header import header_for
 from hilbo.session.log.log_files import log_name
 from hilbo.simulation.presets import preset_of
+from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
+from hilbo.study.estimate.aggregate import aggregate_cohort
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 
@@ -86,3 +90,12 @@ log.close()
 with EventLog.resume(log.path, study.file) as again:
     print("the same state:", again.state == log.state, "in", again.state.seq, "events")
 print("looked up:", chooser.looked_up, "computed while somebody felt:", chooser.fits)
+
+# %% [markdown]
+# ## This participant's map
+# The answers of the log's folder as a table, and the map that they make; the star is its optimum.
+
+# %%
+cohort = cohort_of(read_log_trials(folder, study.file), study)
+aggregate = aggregate_cohort(study, cohort)
+map_slices(study, aggregate.surface, aggregate.optimum.x, cohort)

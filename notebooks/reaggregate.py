@@ -12,7 +12,6 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp
-import matplotlib.pyplot as plt  # noqa: F401  (in a notebook, it shows figures below their cells)
 import numpy as np
 
 import hilbo

@@ -18,12 +18,13 @@ import pandas as pd
 
 import hilbo
 from hilbo import Study
+from hilbo.report.figures.maps import map_slices
 from hilbo.report.study.report import write_study
 from hilbo.search.candidates import search_points
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import people, simulate_study, to_table, truth_table
 from hilbo.simulation.validation_sessions import sets_table, validation_table
-from hilbo.study.analysis.tolerance import best_mid_worst
+from hilbo.study.analysis.best_mid_worst import best_mid_worst
 from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.estimate.aggregate import aggregate_cohort
 from hilbo.study.folder import read_folder
@@ -64,7 +65,7 @@ for number, (name, truth) in enumerate(MATERIALS.items()):
     write_trials(table, folder / "one.csv")
     cohort = cohort_of(read_trials(folder / "one.csv", study), study)
     aggregate = aggregate_cohort(study, cohort, alternatives=False)
-    three = best_mid_worst(study, aggregate.surface, search_points(study.space, 0), known=0.95)
+    three = best_mid_worst(study, aggregate.surface, search_points(study.space, 0))
     renderings = sets_table(study, three, np.asarray(aggregate.individuals.x))
     judged = validation_table(study, population, renderings, participants=8, judges=4, seed=number)
     prefix = f"{name}: "
@@ -91,3 +92,9 @@ for claim in content["hypotheses"]:
     for item in claim["evidence"]:
         print("   ", item["side"], "-", item["text"])
 print("written:", len(list(out.rglob("*"))), "files,", out / "report.html")
+
+# %% [markdown]
+# The map of the last material; the star is its optimum.
+
+# %%
+map_slices(study, aggregate.surface, aggregate.optimum.x, cohort)

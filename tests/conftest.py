@@ -1,5 +1,7 @@
 """What every test runs under: float64, strict promotion, shapes checked at every call of what states some."""
 
+import contextlib
+import ctypes
 import datetime
 import gc
 import itertools
@@ -48,6 +50,7 @@ settings.register_profile("search", deadline=None, max_examples=500, print_blob=
 settings.load_profile("fixed")
 
 MANY_MAPPINGS = 30_000
+MUCH_MEMORY = 4 * 2**30  # bytes
 gc.set_threshold(200_000, 50, 1000)  # traces are many small objects: Python's own thresholds cost a sixth
 REQUIRE_ALL = os.environ.get("HILBO_REQUIRE_ALL", "") not in ("", "0")
 
@@ -79,15 +82,21 @@ def _date_arviz():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _few_mappings():
-    """Compiled functions are let go after a file that left many: each is mapped into memory several times, and a
-    process that passes the kernel's limit (vm.max_map_count, 65,530) ends by a segmentation fault while it compiles."""
+def _bounded_memory():
+    """Compiled functions are let go after a file that left many. Each is mapped into memory several times, and a
+    process that passes the kernel's limit (vm.max_map_count, 65,530) ends by a segmentation fault while it compiles.
+    Workers of the slow tests grew to 11 GB each, which left no room for the browsers and programs that tests begin."""
     yield
     maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPPINGS:
+    if not maps.exists():
+        return
+    resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    if resident > MUCH_MEMORY or maps.read_bytes().count(b"\n") > MANY_MAPPINGS:
         jax.clear_caches()
         gc.unfreeze()
         gc.collect()
+        with contextlib.suppress(OSError, AttributeError):  # of other C libraries than GNU's
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -22,8 +22,8 @@ MAY_IMPORT = {
     "numerics": set(),
     "kernels": {"numerics"},
     "bcm": {"numerics"},
-    "acquisition": {"numerics"},
     "likelihoods": {"numerics"},
+    "acquisition": {"likelihoods"},
     "gaussian": {"numerics"},
     "newton_steps": {"gaussian"},
     "laplace": {"newton_steps"},
@@ -94,7 +94,7 @@ MATHS = {
             *("motor.friction", "motor.friction_laws"),
         )
     ),
-    *("study.analysis.tolerance", "study.analysis.tolerance_intervals"),
+    *(f"study.analysis.{name}" for name in ("best_mid_worst", "tolerance")),
     *("session.choose.selection", "session.choose.ask_tell", "simulation.simulate"),
 }
 ASKS_THE_PROCESS = {"numerics.compiling"}  # which flags XLA was given

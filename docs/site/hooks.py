@@ -20,9 +20,9 @@ API = {
     "inference": ("Inference and hyperparameters", "laplace gaussian inference.exact hyperparameters.maximum_evidence"),
     "aggregation": (
         "Aggregation",
-        "bcm study.cohort study.estimate.aggregate study.estimate.optimum study.analysis.tolerance"
-        " study.analysis.rule_comparison population.pointwise population.shared.hierarchical population.learnt.rule"
-        " population.judged.response_quality",
+        "bcm study.cohort study.estimate.aggregate study.estimate.optimum study.analysis.best_mid_worst"
+        " study.analysis.tolerance study.analysis.rule_comparison population.pointwise population.shared.hierarchical"
+        " population.learnt.rule population.judged.response_quality",
     ),
     "mechanics": (
         "Mechanics and search space",

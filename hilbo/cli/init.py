@@ -34,6 +34,7 @@ def init(
         ),
     ] = None,
     responses: Annotated[str, typer.Option(help="The answers, lowest first.")] = "different,similar,close",
+    goal: Annotated[str, typer.Option(help="The answer that is searched for; by default the highest.")] = "",
     trials: Annotated[int, typer.Option(min=1, help="How many trials a participant has.")] = 25,
     device: Annotated[bool, typer.Option("--device", help="Our device renders; else a program presents.")] = False,
     by: Annotated[str, typer.Option(help="Without --device: a program presents, or a person by hand.")] = "program",
@@ -49,7 +50,7 @@ def init(
     if device and by == "person":
         raise InputError("--by person stands beside --device; leave one of them out.")
     answers = tuple(text.strip() for text in responses.split(","))
-    new = NewStudy(name or study.stem, parameters, answers, trials, device, by, tuple(constraint or ()))
+    new = NewStudy(name or study.stem, parameters, answers, trials, device, by, goal.strip(), tuple(constraint or ()))
     text = study_text(new)
     write_new(study, text, force)
     print(f"{study}: written; read it, then hilbo doctor {study}", file=sys.stderr)

@@ -105,7 +105,17 @@ def session(
         if hub.state.study.stimulus is not None and line.device != "sim":
             raise InputError(f"{study}: has no [renderer], and a device nothing to render; leave --device out.")
         hub.gap = served.gap
+        _say_changes(study, hub.state.study)
         _serve(hub, place, served, as_json)
+
+
+def _say_changes(path: Path, own) -> None:
+    """Print on stderr in which keys the study file at `path` differs from the one that a resumed session goes on with
+    (`own`); nothing if they are the same."""
+    from hilbo.study.file.reading import StudyFile
+
+    if keys := StudyFile.load(path).changes(own):
+        print(f"study file:   as when the session began; now it differs in {', '.join(keys)}", file=sys.stderr)
 
 
 def _serve(hub, place, served, as_json) -> None:

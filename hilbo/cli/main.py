@@ -12,6 +12,7 @@ import typer
 
 from hilbo.cli import live as cli_live
 from hilbo.cli import material as cli_material
+from hilbo.cli import plan as cli_plan
 from hilbo.cli import session
 from hilbo.cli import study as cli_study
 from hilbo.cli import tried as cli_tried
@@ -83,7 +84,7 @@ app.command()(cli_live.session)
 app.command()(cli_live.doctor)
 app.command("try")(cli_tried.tried)
 app.command()(init)
-app.command()(session.plan)
+app.command()(cli_plan.plan)
 app.command()(session.export)
 app.add_typer(session.app_participants, name="participants")
 app.command()(cache)

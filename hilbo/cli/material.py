@@ -43,7 +43,8 @@ def identify(
 ) -> None:
     """Find the parameters of a material from creep and relaxation tests, or from moduli.
 
-    Writes result.json, figures and report.html to the folder --out.
+    Writes result.json, figures and report.html to the folder --out, for tests with a force also the [renderer] block of
+    a study file and sets.csv, the reference of a report.
     """
     check_choice("memory", memory, ("short", "full"))
     check_choice("begin", begin, ("rest", "equilibrium"))
@@ -72,7 +73,7 @@ def identify(
         content = report_material.identification_result(
             table.name, measurements.tests, result, measurements.stiffness_unit, measurements.notes, damping
         )
-        report_material.write_identification(measurements.tests, result, content, folder, damping)
+        report_material.write_identification(measurements.tests, result, content, folder, damping, material)
     finish(content, out, as_json)
 
 

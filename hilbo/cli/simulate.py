@@ -3,14 +3,28 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hilbo.cli.aggregate import aggregate_cohort
 from hilbo.cli.live import live as hold_session
-from hilbo.cli.terminal.console import Force, Json, Out, Preset, Say, finish, progress, results, seed_option, start
+from hilbo.cli.terminal.console import (
+    Force,
+    Json,
+    Out,
+    Preset,
+    Say,
+    finish,
+    progress,
+    results,
+    seed_option,
+    start,
+)
 from hilbo.errors import InputError
+
+if TYPE_CHECKING:
+    from hilbo.simulation.folder import Simulated
 
 __all__ = ["simulate"]
 
@@ -38,15 +52,20 @@ def simulate(
 ) -> None:
     """Simulate a study of known truth and aggregate it; with --live, run one session with a simulated participant.
 
-    Writes the simulated trials and their results, or the session's log and screenshots, to the folder --out.
+    Writes the simulated trials and their results, of each material to a folder of its name, or the session's log and
+    screenshots, to the folder --out.
     """
     _check_mode(live, {"--participants": participants, "--force": force}, {"--kind": kind, "--seconds": seconds})
     if live:
         _simulate_live(preset, study, out, kind or "optimisation", seconds, seed, as_json)
         return
     with results(out, force) as folder, progress() as say:
-        content = _simulate(preset, study, participants or _PEOPLE, seed, folder, say)
-    finish(content, out, as_json, say.printed)
+        contents = _simulate(preset, study, participants or _PEOPLE, seed, folder, say)
+    for name, content in contents.items():
+        finish(content, out / name, as_json and not name, say.printed)
+    if as_json and "" not in contents:
+        written = ((name, (out / name / "result.json").read_text(encoding="utf-8")) for name in contents)
+        print(f'{{"materials": {{{", ".join(f"{json.dumps(name)}: {text}" for name, text in written)}}}}}')
 
 
 def _check_mode(live: bool, of_a_study: Mapping[str, Any], of_a_session: Mapping[str, Any]) -> None:
@@ -60,21 +79,40 @@ def _check_mode(live: bool, of_a_study: Mapping[str, Any], of_a_session: Mapping
         raise InputError(f"{given[0]} does nothing without --live; add --live, or leave it out.")
 
 
-def _simulate(preset: str | None, source: Path | None, count: int, seed: int, folder: Path, say: Say) -> dict[str, Any]:
-    """Simulate `count` participants of the study file `source` (None: the paper's), write their trials and results to
-    `folder`, and return the content of result.json; the error of the optimum is printed."""
+def _simulate(
+    preset: str | None, source: Path | None, count: int, seed: int, folder: Path, say: Say
+) -> dict[str, dict[str, Any]]:
+    """Simulate `count` participants of the study file `source` (None: the paper's), write their trials to `folder`, and
+    each material's results there, or to a folder named after it. Returns that folder's name ("" without materials) ->
+    content of result.json."""
     say("simulating")
     start()
-    from hilbo.report.registration import selection_words
+    from hilbo.report.validation import folder_names
     from hilbo.simulation.folder import simulate_folder
 
-    simulated = simulate_folder(folder, preset, count, seed, source)
-    chosen = selection_words(simulated.study.file.selection)
-    study, truth = simulated.study, simulated.truth
-    content = aggregate_cohort(study, simulated.cohort, folder, seed, say, truth, selection=chosen)
+    contents = {}
+    every = simulate_folder(folder, preset, count, seed, source)
+    names = folder_names([simulated.material for simulated in every])
+    for simulated in every:
+        name = names[simulated.material] if simulated.material else ""
+        if name:
+            say(simulated.material)
+            (folder / name).mkdir()
+        contents[name] = _aggregated(simulated, folder / name, seed, say)
+    return contents
+
+
+def _aggregated(simulated: "Simulated", folder: Path, seed: int, say: Say) -> dict[str, Any]:
+    """Aggregate the simulated responses to one material into `folder`, and return the content of result.json. The error
+    of the optimum is printed, if one stimulus is the best."""
+    from hilbo.report.registration import selection_words
     from hilbo.study.estimate.location import truth_sentence
 
-    say.tell([truth_sentence(study, truth, content["truth"]["nrmse"]["aggregate"]["nrmse"])])
+    study = simulated.study
+    truth, chosen = simulated.truth if study.one_optimum else None, selection_words(study.file.selection)
+    content = aggregate_cohort(study, simulated.cohort, folder, seed, say, truth, selection=chosen)
+    if truth is not None:
+        say.tell([truth_sentence(study, truth, content["truth"]["nrmse"]["aggregate"]["nrmse"])])
     return content
 
 

@@ -3,12 +3,15 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hilbo.cli.terminal.console import Force, Json, Out, Preset, finish, progress, results, seed_option, start
 from hilbo.errors import InputError
+
+if TYPE_CHECKING:
+    from hilbo.study.config import Study
 
 __all__ = ["power", "report", "simulated_report", "validate"]
 
@@ -43,6 +46,7 @@ def power(
     out: Out,
     preset: Preset = None,
     rule: Annotated[str | None, typer.Option(help="Rule of aggregation in place of the study file's.")] = None,
+    material: Annotated[str | None, typer.Option(help="Which of the study's materials.")] = None,
     participants: Annotated[str, typer.Option(help="How many people, separated by commas.")] = "6,12,24",
     trials: Annotated[str, typer.Option(help="How many trials each, separated by commas.")] = "10,15,20,25",
     error: Annotated[
@@ -67,7 +71,9 @@ def power(
         from hilbo.study.config import Study
         from hilbo.study.estimate.learnt import by_rule
 
-        chosen = Study.load(study)
+        whole = Study.load(study)
+        material = material or _only_material(whole)
+        chosen = whole.material(material) if material else whole
         chosen = chosen if rule is None else by_rule(chosen, rule)
         name, population = population_of(chosen, preset)
         plan = Plan(_numbers(participants, "--participants"), _numbers(trials, "--trials"), studies, seed)
@@ -76,9 +82,23 @@ def power(
         errors = simulate_power(
             chosen, population, plan, jobs=jobs, begin=start, say=lambda done: say("studies", done, studies)
         )
-        cost = {"seconds": time.perf_counter() - begun, "jobs": jobs, "cores": cores(), "preset": name}
+        cost = {
+            "seconds": time.perf_counter() - begun,
+            "jobs": jobs,
+            "cores": cores(),
+            "preset": name,
+            "material": material,
+        }
         content = write_power(chosen, errors, plan, error, cost, folder)
     finish(content, out, as_json)
+
+
+def _only_material(study: "Study") -> str | None:
+    """Name of the only material of a study; None if it has none. Raises `InputError` if it has several."""
+    named = study.file.materials
+    if len(named) > 1:
+        raise InputError(f"power: the study has several materials ({', '.join(named)}); choose one with --material.")
+    return named[0] if named else None
 
 
 def _numbers(text: str, option: str) -> tuple[int, ...]:
@@ -98,6 +118,9 @@ def report(
     compare: Annotated[
         bool, typer.Option(help="Compare all rules of aggregation, each person left out in turn.")
     ] = True,
+    people: Annotated[
+        Path | None, typer.Option(help="participants.csv: the page describes ages and handedness; no row is copied.")
+    ] = None,
     seed: Annotated[int, seed_option("of bootstrap resamples, and of the points among which optima are sought")] = 0,
     force: Force = False,
     as_json: Json = False,
@@ -112,9 +135,11 @@ def report(
         start()
         say("reading")
         from hilbo.report.study.report import write_study
+        from hilbo.session.plan.participants import read_people
         from hilbo.study.folder import read_folder
 
-        content = write_study(read_folder(folder, exclude), destination, seed, say, comparison=compare)
+        listed = None if people is None else read_people(people)
+        content = write_study(read_folder(folder, exclude), destination, seed, say, comparison=compare, people=listed)
     finish(content, out, as_json)
 
 
@@ -130,13 +155,14 @@ def simulated_report(folder: Path, seed: int, say: Callable[..., None], count: i
     from hilbo.study.folder import read_folder
 
     say("simulating")
-    study, population, _, _ = simulate_folder(folder, "paper", count, seed)
+    (simulated,) = simulate_folder(folder, "paper", count, seed)
     (material,) = read_folder(folder).materials
     analysis = analyse(material.study, material.cohort, seed, say)
     if analysis.sets is not None:
         say("simulated validation sessions")
         individual_optima = np.asarray(analysis.aggregate.individuals.x)
-        sets = sets_table(study, analysis.sets, individual_optima)
+        sets = sets_table(simulated.study, analysis.sets, individual_optima)
         sets.to_csv(folder / "sets.csv", index=False)
-        validation_table(study, population, sets, seed=seed).to_csv(folder / "validation.csv", index=False)
+        judged = validation_table(simulated.study, simulated.population, sets, seed=seed)
+        judged.to_csv(folder / "validation.csv", index=False)
     return write_study(read_folder(folder), folder, seed, say, {material.name: analysis}, comparison=False)

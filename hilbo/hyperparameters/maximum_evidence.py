@@ -1,10 +1,10 @@
 """Hyperparameters by maximum evidence, with or without weak priors, for one participant or shared by all.
 
-Unconstrained coordinates: log theta, log variance, log noise, the first threshold and the logs of the gaps between
-thresholds, so that learnt thresholds stay ordered. Hyperparameters that are not learnt keep the model's values. Two
-invariances of the model have to be removed: its scale (f, thresholds and noise times s, variance times s^2, give the
-same probabilities), by not learning all of variance, noise and thresholds together; and its shift, which the prior's
-mean 0 fixes.
+Unconstrained coordinates: log theta, log variance, log noise, the first threshold in prior standard deviations, and the
+logs of the gaps between thresholds, so that learnt thresholds stay ordered. Hyperparameters that are not learnt keep
+the model's values. Two invariances of the model have to be removed: its scale (f, thresholds and noise times s,
+variance times s^2, give the same probabilities), by not learning all of variance, noise and thresholds together; and
+its shift, which the prior's mean 0 fixes.
 
 Weak priors, centred at the model's own values: log theta sd 1.5, log variance, log noise and log gaps sd 1, first
 threshold sd 1 in units of the prior's standard deviation. With few ordinal responses the evidence often has no maximum

@@ -16,6 +16,8 @@ participant in the directions in which that participant's posterior is precise. 
 Computation 12:2719, section 3.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -45,15 +47,21 @@ class JointMap(eqx.Module):
         noise = jax.random.normal(key, (count, self.root.shape[1]), self.root.dtype)
         return self.mean[None, :] + noise @ self.root.T
 
-    def optima(self, key: PRNGKeyArray, count: int, block: int = 256) -> Float[Array, " m"]:
-        """Share of draws of the map whose maximum is at each point, (m,); the shares sum to 1.
+    def optima(
+        self,
+        key: PRNGKeyArray,
+        count: int,
+        block: int = 256,
+        closeness: Callable[[Float[Array, "n m"]], Float[Array, "n m"]] = lambda f: f,
+    ) -> Float[Array, " m"]:
+        """Share of draws of the map whose `closeness` to the goal is largest at each point, (m,); the shares sum to 1.
 
         `count`: number of draws, rounded up to a multiple of `block`, of which so many are in memory at a time.
         """
         blocks = -(-count // block)
 
         def add(total, key):
-            best = jnp.argmax(self.draw(key, block), axis=1)
+            best = jnp.argmax(closeness(self.draw(key, block)), axis=1)
             return total.at[best].add(1.0), None
 
         total, _ = jax.lax.scan(add, jnp.zeros_like(self.mean), jax.random.split(key, blocks))

@@ -12,10 +12,10 @@ from jax.scipy.special import log_ndtr, logsumexp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from hilbo.likelihoods import OrdinalProbit
+from hilbo.likelihoods import Goal, OrdinalProbit
 from hilbo.population.shared.scale_use import ScaleUse
 
-__all__ = ["InTurn", "class_probabilities", "in_turn", "log_highest", "predicted_in_turn", "with_variances"]
+__all__ = ["InTurn", "class_probabilities", "in_turn", "log_goal", "predicted_in_turn", "with_variances"]
 
 _AT_A_TIME = 21  # nodes: each takes n^2 numbers for n responses
 
@@ -39,16 +39,22 @@ def class_probabilities(
     return jnp.tensordot(weights, jax.vmap(given)(people), 1)
 
 
-def log_highest(
-    likelihood: OrdinalProbit, mean: Float[Array, " m"], variance: Float[Array, " m"], scale: ScaleUse | None = None
+def log_goal(
+    likelihood: OrdinalProbit,
+    goal: Goal,
+    mean: Float[Array, " m"],
+    variance: Float[Array, " m"],
+    scale: ScaleUse | None = None,
 ) -> Float[Array, " m"]:
-    """Log probability (m,) of the highest category for a new participant, accurate also where it is small.
+    """Log probability (m,) of the goal as a new participant's response, accurate also where it is small.
 
     `mean`, `variance` (m,): of that participant's function; `scale` as for `class_probabilities`.
     """
 
     def given(person: OrdinalProbit) -> Float[Array, " m"]:
-        return log_ndtr((mean - person.thresholds[-1]) / jnp.sqrt(person.noise**2 + variance))
+        if goal.is_highest:
+            return log_ndtr((mean - person.thresholds[-1]) / jnp.sqrt(person.noise**2 + variance))
+        return jax.vmap(lambda m, v: person.smoothed(m, v, goal.category)[0])(mean, variance)
 
     if scale is None:
         return given(likelihood)

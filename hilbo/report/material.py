@@ -20,7 +20,7 @@ from hilbo.report.result_file import write_result
 from hilbo.report.results import save_figures, versions
 from hilbo.viscoelastic import FOSLS
 
-__all__ = ["identification_result", "renderer_block", "write_identification", "write_passivity"]
+__all__ = ["identification_result", "reference_row", "renderer_block", "write_identification", "write_passivity"]
 
 
 def identification_result(
@@ -110,12 +110,18 @@ def renderer_block(result: Characterisation, damping: float | None) -> str:
 
 
 def write_identification(
-    tests: tuple[Test, ...], result: Characterisation, content: dict[str, Any], folder: Path, damping: float | None
+    tests: tuple[Test, ...],
+    result: Characterisation,
+    content: dict[str, Any],
+    folder: Path,
+    damping: float | None,
+    material: str | None = None,
 ) -> None:
     """Write the results of `hilbo identify` into an existing folder: result.json, curves.csv, figures, report.html.
 
-    For the sampled model renderer.toml and the figures of its set too. `content`: of `identification_result`;
-    `damping`: the device's, N·s/m; None: the figures are drawn for the damping that the set needs.
+    For the sampled model renderer.toml, sets.csv (`reference_row`) and the figures of its set too. `content`: of
+    `identification_result`; `damping`: the device's, N·s/m; None: the figures are drawn for the damping that the set
+    needs.
     """
     from hilbo.report.figures import mechanics as plotting
 
@@ -126,6 +132,7 @@ def write_identification(
         figures["memory"] = plotting.memory_figure(result.rows)
     if content["renderer"] is not None:
         (folder / "renderer.toml").write_text(content["renderer"])
+        reference_row(result, material).to_csv(folder / "sets.csv", index=False)
         figures |= _set_figures(_model(result), damping or result.minimum_damping)
     page = rendered(
         "material.html",
@@ -138,6 +145,22 @@ def write_identification(
         figures=save_figures(figures, folder),
     )
     (folder / "report.html").write_text(page, encoding="utf-8")
+
+
+def reference_row(result: Characterisation, material: str | None) -> pd.DataFrame:
+    """A sets table with one set of source sysid: the parameters of the best curve with their 95 % profile intervals
+    (NAME_low, NAME_high; empty where an end is open), and how they are rendered. The model must be the sampled one.
+    """
+    model, values = result.fit.model, result.fit.parameters()
+    row: dict[str, Any] = {"set_id": f"{material} sysid" if material else "sysid", "source": "sysid"}
+    row |= {"material": material} if material else {}
+    for name in ("K0", "K1", "B1", "alpha"):
+        row[name] = values[name]
+    for name in ("K1", "B1", "alpha"):
+        row[f"{name}_low"], row[f"{name}_high"] = result.estimates[name][1:3]
+    short = model.memory == "short"
+    row |= {"N": int(model.N) if short else None, "T": float(model.T), "memory": model.memory}
+    return pd.DataFrame([row])
 
 
 def _model(result):

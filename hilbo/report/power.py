@@ -36,7 +36,8 @@ def write_power(study: Study, errors: pd.DataFrame, plan: Plan, error: float, co
     of result.json.
 
     `errors`: of every simulated study; `error`: target error of the optimum (NRMSE); `cost`: further keys of
-    result.json, namely `seconds` and `jobs` (run time and number of processes) and `preset` (the simulated population).
+    result.json, namely `seconds` and `jobs` (run time and number of processes), `preset` (the simulated population) and
+    `material` (None for a study without materials).
     """
     from hilbo.report.figures import power
 

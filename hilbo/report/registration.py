@@ -7,10 +7,11 @@ in.
 from collections.abc import Sequence
 from typing import Any
 
+from hilbo.likelihoods import Goal
 from hilbo.population.rules.registry import RULES
 from hilbo.report.page import text_of
 from hilbo.study.file.plan_file import Plan
-from hilbo.study.file.protocols import protocol
+from hilbo.study.file.protocols import Protocol, protocol
 from hilbo.study.file.reading import StudyFile
 
 __all__ = ["registration", "selection_words"]
@@ -19,23 +20,46 @@ _ACQUISITIONS = {
     "ucb": "upper confidence bound",
     "log_ei": "log expected improvement",
     "thompson": "Thompson sampling",
-    "top_category": "probability of the highest answer",
+    "top_category": "probability of the goal",
 }
 
 
 def registration(study: StudyFile, plan: Plan, version: str) -> str:
     """The page, in Markdown. `plan`: of this study, as `make_plan` gives it; `version`: hilbo's. Nothing is written."""
+    goal = Goal.of(study.responses, study.goal)
+    label = study.responses[goal.category]
     return text_of(
         "registration.md",
         study=study,
         plan=plan,
         version=version,
-        trial=protocol(study.session, plan.phase),
+        protocols=_protocols(study, plan),
+        groups=_groups(plan),
         warm_up=protocol(study.session, "warm-up").count,
         selection=selection_words(study.selection),
         rule=RULES[study.rule],
+        optimum=RULES[study.rule].optimum_for(label, goal.is_highest),
+        goal=goal.sentence(label) or f'The goal is the highest answer, "{label}".',
         model=_model(study),
     )
+
+
+def _protocols(study: StudyFile, plan: Plan) -> list[tuple[str, Protocol]]:
+    """The different protocols of the plan's phase, each with the names of its materials as a text; "" if all materials
+    have the same."""
+    names: dict[Protocol, list[str]] = {}
+    for name in plan.materials:
+        session = (study if name is None else study.material(name)).session
+        names.setdefault(protocol(session, plan.phase), []).append(name or "")
+    return [("" if len(names) == 1 else ", ".join(those), of) for of, those in names.items()]
+
+
+def _groups(plan: Plan) -> dict[str, int]:
+    """Material -> number of participants who have it, where they do not all have all; else {}."""
+    have = [{block.material for block in row.header.blocks if block.phase == plan.phase} for row in plan.participants]
+    if all(materials == set(plan.materials) for materials in have):
+        return {}
+    return {name: sum(name in materials for materials in have) for name in plan.materials if name is not None}
 
 
 def selection_words(selection: Any) -> str:

@@ -124,6 +124,8 @@ def result(
         "heterogeneity": heterogeneity(aggregate),
         "inference": study.inference,
         "study": study.file.hash,
+        "meaning": study.file.meaning,
+        "goal": study.goal_label,
         "seed": seed,
         "versions": versions(),
     }
@@ -132,7 +134,7 @@ def result(
         content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
     warnings = [*left_out, *_not_converged(people), *rule_warnings(study, aggregate), *learnt_sentences(study)]
     warnings += location_sentences(study, best.x, best.sd, aggregate.asked_variance)
-    content["warnings"] = warnings + region_sentences(region) + check_sentences(check)
+    content["warnings"] = warnings + region_sentences(region, study.one_optimum) + check_sentences(check)
     content["optimum_region"] = region_content(study, region)
     content["model_check"] = check
     content["highest_answer"] = None if highest is None else highest._asdict()
@@ -226,8 +228,8 @@ def _truth(study, aggregate, truth):
     """Entry `truth` of result.json: NRMSE to the known optimum `truth` (d,) in the unit cube, of the map's optimum, the
     alternatives and the mean of the individual optima; quartiles over the individual optima, each with and without K0.
 
-    Also mean and sd of the number of highest responses per participant; the sd is None for one participant. Raises
-    `InputError` if individual optima were not computed.
+    Also mean and sd of the number of responses per participant that are the goal; the sd is None for one participant.
+    Raises `InputError` if individual optima were not computed.
     """
     individual_misses, individual_misses_with_K0 = misses(study, aggregate.individuals.x, truth)
     quartiles = np.percentile(individual_misses, [25, 50, 75]).tolist()
@@ -244,7 +246,7 @@ def _truth(study, aggregate, truth):
         else np.percentile(individual_misses_with_K0, [25, 50, 75]).tolist(),
     }
     trials = aggregate.cohort.trials
-    top = ((np.asarray(trials.q) == len(study.responses) - 1) & np.asarray(trials.mask)).sum(axis=1)
+    top = ((np.asarray(trials.q) == study.goal.category) & np.asarray(trials.mask)).sum(axis=1)
     return {
         "parameters": Rendering.at(study.space, truth).shown,
         "nrmse": table,

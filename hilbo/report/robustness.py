@@ -65,7 +65,7 @@ def robustness_page(study: Study, content: Content, figures: Pictures) -> str:
         figures=figures,
         limit=LIMIT,
         near=NEAR,
-        top=study.responses[-1],
+        top=study.goal_label,
         learns=RULES[study.rule].learns,
         predicts=RULES[study.rule].predicts,
         sensitivity={name: np.atleast_2d(np.asarray(block).T) for name, block in blocks.items()},
@@ -169,7 +169,7 @@ def _percentiles(draws):
 
 def _warnings(check):
     """Warnings as sentences: a correlation length below a tenth of a search range, an optimised model by which the
-    highest response is nowhere the likeliest, and a search that did not converge.
+    goal is nowhere the likeliest response, and a search that did not converge.
     """
     both = check.hyperparameters
     alike, sentences = _correlation(both.optimised), []
@@ -179,9 +179,10 @@ def _warnings(check):
             f" {alike:.2g}: the answers do not make a smooth map, and an optimum found with it says little."
         )
     chances = np.asarray(check.optimised.optimum.class_probabilities)
-    if np.argmax(chances) != len(chances) - 1:
+    goal = both.optimised.goal.category
+    if np.argmax(chances) != goal:
         sentences.append(
-            f'Under the optimised hyperparameters "{both.optimised.responses[-1]}" is not the likeliest answer of a new'
-            f" participant, even at the optimum ({100 * chances[-1]:.0f} %)."
+            f'Under the optimised hyperparameters "{both.optimised.goal_label}" is not the likeliest answer of a new'
+            f" participant, even at the optimum ({100 * chances[goal]:.0f} %)."
         )
     return [*sentences, *both.limits, *learnt_sentences(both.optimised)]

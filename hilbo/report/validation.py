@@ -79,14 +79,15 @@ def validate(
     sets: pd.DataFrame | None = None,
     responses: Sequence[str] = RESPONSES,
     material: str | None = None,
+    goal: str | None = None,
 ) -> Validated:
     """Statistics of the comparisons of one material; `material` may be None if the table has only one.
 
-    `sets`: the sets table, indexed by `set_id`, or None; `responses`: labels, lowest first. Raises `InputError` for an
-    invalid table.
+    `sets`: the sets table, indexed by `set_id`, or None; `responses`: labels, lowest first; `goal`: the one that is
+    searched for, by default the last. Raises `InputError` for an invalid table.
     """
     chosen = of_material(check_validation(table, responses), material)
-    tables = paper_tables(chosen, sets, responses=responses)
+    tables = paper_tables(chosen, sets, responses=responses, goal=goal)
     rows = aggregate_comparisons(chosen, *set_sources(chosen, sets))
     decided = rows[rows["preferred"] != TIE]
     won = (decided["preferred"] != "individual").to_numpy()
@@ -255,7 +256,7 @@ def write_validation(
     folders = folder_names(names)
     for name in names:
         say(f"validation sessions{'' if name is None else f' of {name}'}")
-        validated = validate(table, sets_by_id, study.responses, name)
+        validated = validate(table, sets_by_id, study.responses, name, study.goal_label)
         material_folder = folder if len(names) == 1 else folder / folders[name]
         material_folder.mkdir(exist_ok=True)
         for file, frame in validation_csv(validated).items():

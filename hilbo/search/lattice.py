@@ -46,7 +46,7 @@ class OptimisticScore(Protocol):
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""], /) -> Float[Array, "..."]:
         """Upper bound of the score given the posterior mean, over variances from 0 to `prior`.
 
-        Non-decreasing in the mean.
+        Monotone in the mean, or with one maximum.
         """
         ...
 
@@ -253,7 +253,8 @@ class _Values(eqx.Module):
     def bound(self, mean: Float[Array, "..."]) -> Float[Array, "..."]:
         """Upper bound of the score given the posterior mean, with a margin for rounding."""
         slack = _SLACK * jnp.finfo(mean.dtype).eps * jnp.sum(jnp.abs(self.weights)) * self.prior
-        return self.score.optimistic(mean + slack, self.prior)
+        ends = (self.score.optimistic(mean + way * slack, self.prior) for way in (1, -1))
+        return jnp.maximum(*ends)
 
     def __call__(self, cross: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Values and hopes (m,) for prior covariances `cross`; -inf if the score is not a number."""

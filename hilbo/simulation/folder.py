@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 
 from hilbo.simulation import simulate
@@ -17,30 +18,56 @@ from hilbo.study.tables.trials import write_trials
 
 __all__ = ["Simulated", "simulate_folder"]
 
+_NEXT = 100_003  # between the seeds of two materials: far more than seeds that a user tries
+
 
 class Simulated(NamedTuple):
-    """Simulated study, its participants' responses, and the true optimum of their population, (d,) in the unit cube."""
+    """Simulated responses to one material (its name; "" if the study has none), and the true optimum of the population,
+    (d,) in the unit cube."""
 
+    material: str
     study: Study
     population: Population
     cohort: Cohort
     truth: Float[np.ndarray, " d"]
+    trials: pd.DataFrame
+    truths: pd.DataFrame
+    """As in truth.csv."""
 
 
-def simulate_folder(folder: Path, preset: str | None, count: int, seed: int, source: Path | None = None) -> Simulated:
+def simulate_folder(
+    folder: Path, preset: str | None, count: int, seed: int, source: Path | None = None
+) -> tuple[Simulated, ...]:
     """Simulate `count` participants and write trials.csv, truth.csv and study.toml to an existing folder, over existing
-    files.
+    files. Of a study with materials each has `count` participants of its own (P01 of one is not P01 of another), and
+    the tables have a column `material`.
 
     `preset`: name of the population, as in `population_of`. `source`: a study file instead of the paper's. Raises
     InputError for an invalid study file, an unknown preset, and a population that does not fit the study.
     """
     path = Path(str(files("hilbo") / "data" / "paper.toml")) if source is None else source
-    study = Study.load(path)
+    whole = Study.load(path)
+    simulated = [
+        _simulated(whole.material(name) if name else whole, name, preset, count, seed + _NEXT * number)
+        for number, name in enumerate(whole.file.materials or ("",))
+    ]
+    write_trials(_together([(each.material, each.trials) for each in simulated]), folder / "trials.csv")
+    write_trials(_together([(each.material, each.truths) for each in simulated]), folder / "truth.csv")
+    shutil.copyfile(path, folder / "study.toml")
+    return tuple(simulated)
+
+
+def _simulated(study: Study, material: str, preset: str | None, count: int, seed: int) -> Simulated:
+    """Simulate the sessions of one material."""
     population = with_truth(study, population_of(study, preset)[1], seed)
     people = simulate.people(study, population, count, seed)
     table = simulate.to_table(study, simulate.simulate_study(study, people, seed))
-    write_trials(table, folder / "trials.csv")
-    write_trials(simulate.truth_table(study, population, people), folder / "truth.csv")
-    shutil.copyfile(path, folder / "study.toml")
     truth = np.asarray(study.space.to_unit(np.array([population.truth[name] for name in study.space.names])))
-    return Simulated(study, population, cohort_of(table, study), truth)
+    truths = simulate.truth_table(study, population, people)
+    return Simulated(material, study, population, cohort_of(table, study), truth, table, truths)
+
+
+def _together(tables: list[tuple[str, pd.DataFrame]]) -> pd.DataFrame:
+    """The tables of all materials as one, with a column `material` if these have names."""
+    named = [table.assign(material=name) if name else table for name, table in tables]
+    return pd.concat(named, ignore_index=True)

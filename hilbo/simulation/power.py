@@ -7,7 +7,7 @@ drift over the study's own number of trials), so that a short session drifts les
 
 For every (m, t) a study is aggregated by the study's rule, and two errors are taken:
   optimum: NRMSE of the population optimum to the truth, in units of the search ranges;
-  map: root mean square, over feasible points, of the difference between the probability of the highest answer that the
+  map: root mean square, over feasible points, of the difference between the probability of the goal that the
        map predicts for a new person and the one that the simulated population has (the mean over many people, in
        closed form).
 Studies are dealt to processes, one core each; the numbers do not depend on how many there are.
@@ -29,20 +29,21 @@ from scipy.special import ndtr
 from scipy.stats import binomtest
 
 from hilbo.errors import InputError
+from hilbo.likelihoods import Goal
 from hilbo.numerics.tracing import program
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map
 from hilbo.population.rules.registry import RULES
 from hilbo.search.apart import differences
 from hilbo.search.candidates import search_points
 from hilbo.simulation.presets import with_truth
-from hilbo.simulation.simulate import Person, Population, felt_apart, people, simulate_study
+from hilbo.simulation.simulate import Person, Population, people, simulate_study
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import fit_cohort
 from hilbo.study.estimate.learnt import by_rule, resolved
 from hilbo.study.estimate.optimum import map_optimum
 
-__all__ = ["Plan", "cores", "one_study", "power_table", "simulate_power", "summarise", "top_probability"]
+__all__ = ["Plan", "cores", "goal_probability", "one_study", "power_table", "simulate_power", "summarise"]
 
 _POINTS = 256  # at which maps are compared
 _CROWD = 2000  # people whose mean is the population's truth
@@ -82,6 +83,11 @@ def simulate_power(
     given; otherwise it computes with JAX's defaults. `say` receives the number of finished studies. Raises `InputError`
     for numbers of participants or responses that the study's method cannot aggregate.
     """
+    if not study.one_optimum:
+        raise InputError(
+            f'power: many stimuli are as good as the optimum, since the goal "{study.goal_label}" is between other'
+            " answers and there are several parameters; plan with one parameter, or with a goal at an end of the scale."
+        )
     _check_rule(study.rule, plan)
     jobs = min(cores() if jobs is None else jobs, plan.studies)
     sent = study.file.content, study.rule, population_, plan
@@ -154,7 +160,7 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
     candidates = search_points(study.space, 0)
     points = candidates[:_POINTS]
     truth = np.asarray(study.space.to_unit(np.array([population_.truth[name] for name in study.space.names])))
-    target = top_probability(people(study, population_, _CROWD, 0), len(study.responses), np.asarray(points))
+    target = goal_probability(people(study, population_, _CROWD, 0), study.goal, np.asarray(points))
     rows = {}
     for count in _turned(plan.trials, index):
         so_far = cohort.first(count)
@@ -167,7 +173,7 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
             else:
                 map_ = learnt_map(judged.learnt, given)
             x = np.asarray(map_optimum(judged, map_, candidates).x)
-            probabilities = np.asarray(_map_top_probability(judged, map_, points))
+            probabilities = np.asarray(_map_goal_probability(judged, map_, points))
             rows[m, count] = _rms(differences(persons.levels, x, truth)), _rms(probabilities - target)
     cells = [(index, m, count, *rows[m, count]) for count in plan.trials for m in plan.participants]
     return pd.DataFrame(cells, columns=["study", "participants", "trials", "optimum", "map"])
@@ -184,9 +190,9 @@ def _rms(difference: Float[np.ndarray, "..."]) -> float:
 
 
 @program
-def _map_top_probability(study: Study, map_: RuleMap, points: Float[Array, "m d"]) -> Float[Array, " m"]:
-    """Predicted probability of a new participant's highest response at each point. (m,)."""
-    return map_.class_probabilities(study.gp.likelihood, points)[:, -1]
+def _map_goal_probability(study: Study, map_: RuleMap, points: Float[Array, "m d"]) -> Float[Array, " m"]:
+    """Predicted probability of the goal as a new participant's response at each point. (m,)."""
+    return map_.class_probabilities(study.gp.likelihood, points)[:, study.goal.category]
 
 
 def _with_trials(study: Study, trials: int) -> Study:
@@ -198,18 +204,18 @@ def _with_trials(study: Study, trials: int) -> Study:
     return by_rule(Study.from_dict({"schema": 1} | content), study.rule)
 
 
-def top_probability(persons: Person, categories: int, x: Float[np.ndarray, "m d"]) -> Float[np.ndarray, " m"]:
-    """Probability (m,) of the highest response in the middle of a session, averaged over the simulated persons.
+def goal_probability(persons: Person, goal: Goal, x: Float[np.ndarray, "m d"]) -> Float[np.ndarray, " m"]:
+    """Probability (m,) of the goal as the response in the middle of a session, averaged over the simulated persons.
 
-    P = (1 - lapse) Phi((lowest criterion - distance - drift / 2) / noise) + lapse / C.
+    With the criteria around the goal, of which the upper one is infinite for the lowest response and the lower one for
+    the highest, P = (1 - lapse) (Phi(upper) - Phi(lower)) + lapse / C, each in units of the noise from s + drift / 2.
     """
-    optimum, tolerance = np.asarray(persons.optimum), np.asarray(persons.tolerance)
-    away = felt_apart(persons.levels, x[:, None, :], optimum[None])
-    distance = np.sqrt(np.sum((away / tolerance[None]) ** 2, axis=2))
-    strict = np.asarray(persons.criteria).min(axis=1)[None, :]
-    felt = (strict - distance - np.asarray(persons.drift)[None, :] / 2) / np.asarray(persons.noise)[None, :]
-    lapses = np.asarray(persons.lapse)[None, :]
-    return np.mean((1 - lapses) * ndtr(felt) + lapses / categories, axis=1)
+    each = jax.tree.map(lambda leaf: np.asarray(leaf), persons)
+    infinite = np.full((len(each.noise), 1), np.inf)
+    edges = np.concatenate([infinite, each.criteria, -infinite], axis=1)[:, [goal.category, goal.category + 1]]
+    steady = each.perceived(x[:, None, :]) + each.direction * each.drift / 2
+    upper, lower = (ndtr((edge - steady) / each.noise) for edge in edges.T)
+    return np.mean((1 - each.lapse) * (upper - lower) + each.lapse / goal.categories, axis=1)
 
 
 def summarise(errors: pd.DataFrame, error: float) -> pd.DataFrame:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hilbo.errors import InputError
+from hilbo.likelihoods import Goal
 from hilbo.search.rendering import Rendering
 from hilbo.simulation.simulate import Population
 from hilbo.study.config import Study
@@ -53,12 +54,17 @@ def population_of(study: Study, preset: str | None = None) -> tuple[str, Populat
     and for one with other parameters.
     """
     paper = PRESETS["paper"]
-    fits = _of_these_ranges(study, paper) and len(study.responses) == 1 + len(paper.criteria)
+    fits = study.goal.is_highest and _of_these_ranges(study, paper) and len(study.responses) == 1 + len(paper.criteria)
     if preset is None and not (study.file.simulation is None and fits):
         stated = study.file.simulation
         words = "the study's [simulation]" if stated else "people of no preset, with the defaults of [simulation]"
         return words, _stated(study, stated or SimulationTable())
     name = preset or "paper"
+    if not study.goal.is_highest:
+        raise InputError(
+            f'--preset is "{name}", whose people search for the highest answer, and the goal of this study is'
+            f' "{study.file.goal}"; leave --preset out.'
+        )
     population = preset_of(name)
     if not _of_these_ranges(study, population):
         truth = ", ".join(f"{key} = {value:g}" for key, value in population.truth.items())
@@ -81,17 +87,23 @@ def _of_these_ranges(study: Study, population: Population) -> bool:
 
 def _stated(study: Study, table: SimulationTable) -> Population:
     """Population specified in a [simulation] table."""
-    dim, steps = study.space.dim, len(study.responses) - 1
+    dim = study.space.dim
     return Population(
         truth={p.name: p.number(table.truth[p.name]) for p in study.space.parameters} if table.truth else {},
         spread=each(table.spread, dim),
         tolerance=each(table.tolerance, dim),
         tolerance_sd=table.tolerance_sd,
-        criteria=table.criteria or tuple(1 + _STEP * k for k in reversed(range(steps))),
+        criteria=table.criteria or _criteria(study.goal),
         noise=table.noise,
         lapse=table.lapse,
         drift_sd=table.drift_sd,
     )
+
+
+def _criteria(goal: Goal) -> tuple[float, ...]:
+    """Criteria at even steps, of which the innermost are 1 and -1."""
+    below, above = range(goal.category), range(goal.categories - 1 - goal.category)
+    return (*(1 + _STEP * k for k in reversed(below)), *(-1 - _STEP * k for k in above))
 
 
 def with_truth(study: Study, population: Population, seed: int) -> Population:

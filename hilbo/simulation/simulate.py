@@ -5,9 +5,15 @@ A simulated person prefers one stimulus and perceives every other at a dissimila
     s = sqrt( sum_i ((x_i - optimum_i) / tolerance_i)^2 ) + drift * (trial / trials) + noise * e,    e ~ N(0, 1),
 
 and responds with the highest category whose criterion exceeds s; with probability `lapse` the response is random. Two
-different levels of a parameter have the distance of half a range. This is deliberately not the model that is fitted:
-its tails are linear where the GP's are bounded. A whole study (all participants' space-filling and acquisition trials)
-runs in one compiled call.
+different levels of a parameter have the distance of half a range. Where the study's goal is the lowest response, s is
+negative: -(distance + drift). Where it is between other responses, as of "too soft", "right", "too hard", the person
+perceives in place of the distance the signed sum of the differences
+
+    sum_i (optimum_i - x_i) / tolerance_i / sqrt(d),
+
+so that the preferred stimuli are those of a plane through the optimum. This is deliberately not the model that is
+fitted: its tails are linear where the GP's are bounded. A whole study (all participants' space-filling and acquisition
+trials) runs in one compiled call.
 """
 
 from collections.abc import Mapping
@@ -21,13 +27,14 @@ import pandas as pd
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from hilbo.errors import InputError
+from hilbo.likelihoods import Goal
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
 from hilbo.search.apart import differences, levels_of
 from hilbo.session.choose.selection import Design, design, next_point
 from hilbo.study.config import Study
 
-__all__ = ["Person", "Population", "felt_apart", "people", "simulate_study", "to_table", "truth_table"]
+__all__ = ["Person", "Population", "people", "simulate_study", "to_table", "truth_table"]
 
 _MOST_DRAWS = 2000  # of 64 people each
 _LEVELS_APART = 0.5  # of a range
@@ -40,12 +47,28 @@ class Person(eqx.Module):
     tolerance: Float[Array, "*M d"]
     """Distance along each parameter that is perceived as one unit of dissimilarity."""
     criteria: Float[Array, "*M c"]
-    """Decreasing, C - 1 of them: a dissimilarity below all of them gives the highest category."""
+    """Decreasing, C - 1 of them: an s below all of them gives the highest category. As many are positive as there are
+    categories below the goal."""
     noise: Float[Array, "*M"]
     lapse: Float[Array, "*M"]
     drift: Float[Array, "*M"]
     levels: tuple[int, ...] = eqx.field(static=True, default=())
     """For each parameter its number of unordered levels, 0 for numbers; empty where all are numbers."""
+    goal: Goal | None = eqx.field(static=True, default=None)
+    """Of the study; None is the highest response."""
+
+    @property
+    def direction(self) -> int:
+        """Sign of s: -1 if the lowest response is the goal."""
+        return 1 if self.goal is None or self.goal.category else -1
+
+    def perceived(self, x: Float[Any, "*#M d"]) -> Float[Any, "*#M"]:
+        """The value s of stimuli without drift and noise, an array for which NumPy or JAX is used as for `x`."""
+        xp = jnp if isinstance(x, jax.Array) else np
+        away = felt_apart(self.levels, x, self.optimum) / self.tolerance
+        if self.goal is not None and self.goal.is_between:
+            return -xp.sum(away, axis=-1) / away.shape[-1] ** 0.5
+        return self.direction * xp.sqrt(xp.sum(away**2, axis=-1))
 
     def answer(self, key: PRNGKeyArray, x: Float[Array, " d"], progress: Float[Array, ""]) -> Int[Array, ""]:
         """Simulate the response to the stimulus `x` after the fraction `progress` of the session.
@@ -53,8 +76,8 @@ class Person(eqx.Module):
         `x` (d,) in the unit cube, `progress` from 0 to 1 -> a category, a scalar in 0..C-1.
         """
         perceive, lapse, guess = jax.random.split(key, 3)
-        distance = jnp.sqrt(jnp.sum((felt_apart(self.levels, x, self.optimum) / self.tolerance) ** 2))
-        felt = distance + self.drift * progress + self.noise * jax.random.normal(perceive, (), x.dtype)
+        steady = self.perceived(x) + self.direction * self.drift * progress
+        felt = steady + self.noise * jax.random.normal(perceive, (), x.dtype)
         judged = jnp.sum(felt < self.criteria)
         guessed = jax.random.randint(guess, (), 0, self.criteria.shape[-1] + 1, judged.dtype)
         return jnp.where(jax.random.uniform(lapse, (), x.dtype) < self.lapse, guessed, judged)
@@ -124,6 +147,7 @@ def people(study: Study, population: Population, count: int, seed: int) -> Perso
         lapse=jnp.full(count, population.lapse),
         drift=jnp.asarray(population.drift_sd * rng.standard_normal(count)),
         levels=levels,
+        goal=None if study.goal.is_highest else study.goal,
     )
 
 

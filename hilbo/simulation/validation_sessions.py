@@ -9,14 +9,15 @@ of best, mid and worst four times, and a few judges compare every individual's s
 
 from itertools import combinations
 
+import jax
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
 from hilbo.search.rendering import Rendering
 from hilbo.session.plan.set_codes import OWN, code_of
-from hilbo.simulation.simulate import Person, Population, felt_apart, people
-from hilbo.study.analysis.tolerance import Sets
+from hilbo.simulation.simulate import Person, Population, people
+from hilbo.study.analysis.best_mid_worst import Sets
 from hilbo.study.config import Study
 
 __all__ = ["sets_table", "validation_table"]
@@ -87,13 +88,16 @@ def _answer(
 ) -> tuple[list[str], int]:
     """Simulate a comparison of the stimuli x and y (d,) by one participant of `crowd`: labels of both classes, and the
     preferred one (0: x, 1: y)."""
-    optimum, tolerance = np.asarray(crowd.optimum[person]), np.asarray(crowd.tolerance[person])
-    away = (felt_apart(crowd.levels, point, optimum) / tolerance for point in (x, y))
-    felt = np.array([np.sqrt(np.sum(each**2)) for each in away])
+    one = jax.tree.map(lambda leaf: np.asarray(leaf[person]), crowd)
+    felt = np.array([one.perceived(point) for point in (x, y)])
     felt = felt + float(crowd.noise[person]) * rng.standard_normal(2)
     shown = felt + contrast * (felt - felt[::-1])
     judged = [int((value < np.asarray(crowd.criteria[person])).sum()) for value in shown]
     lapses = rng.random(3) < float(crowd.lapse[person])
     judged = [rng.integers(len(study.responses)) if lapse else c for c, lapse in zip(judged, lapses, strict=False)]
-    preferred = int(rng.integers(2)) if lapses[2] else int(np.argmin(felt))
+    preferred = (
+        int(rng.integers(2))
+        if lapses[2]
+        else int(np.argmin(np.abs(felt) if study.goal.is_between else one.direction * felt))
+    )
     return [study.responses[c] for c in judged], preferred

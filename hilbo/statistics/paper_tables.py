@@ -1,8 +1,8 @@
 """The paper's tables II to IV from a validation table, with every kind of error, and the counts behind them.
 
-II: binary logit of "close" (the highest response) against the rest, on whether the set was *best*. III: ordered logit
-of the class, coded from the highest response (0) to the lowest, on *best* and *worst*, *mid* being the reference: a
-negative coefficient is a shift towards "close". IV: binary logit of preferring the aggregate's set to an individual's,
+II: binary logit of the goal ("close" in the paper) against the rest, on whether the set was *best*. III: ordered logit
+of the class, coded by its distance from the goal (0), on *best* and *worst*, *mid* being the reference: a negative
+coefficient is a shift towards the goal. IV: binary logit of preferring the aggregate's set to an individual's,
 an intercept alone. II and III are clustered by participant, IV by participant and by the individual's set.
 Ties in IV are modelled (`logits.tied_preferences`): 0 is still "neither is preferred".
 """
@@ -46,9 +46,13 @@ def paper_tables(
     sets: pd.DataFrame | None = None,
     *,
     responses: Sequence[str] = RESPONSES,
+    goal: str | None = None,
     level: float = 0.95,
 ) -> PaperTables:
     """Compute all statistics of the paper's validation sessions, for one material.
+
+    `goal`: the response that the study searches for, by default the last; table III orders the others by the number of
+    categories between them and the goal.
 
     `sets` is a sets table (`tables.validation.sets_frame`); its column `role`, if it has one, names the best, mid and
     worst sets. Without it roles are taken from the names, as plans give them: "best", "foam best", "foam P07 best"; and
@@ -62,9 +66,10 @@ def paper_tables(
     staged["preferred"] = [roles.get(name, name) for name in table["preferred"]]
     staged = staged[staged["set_a"].isin(ROLES) & staged["set_b"].isin(ROLES) & (staged["set_a"] != staged["set_b"])]
     answers, tables, limits = classifications(staged, responses), [], []
+    place = len(responses) - 1 if goal is None else responses.index(goal)
     makers = {
-        "II": lambda: _table_2(answers, responses, level),
-        "III": lambda: _table_3(answers, responses, level),
+        "II": lambda: _table_2(answers, responses[place], level),
+        "III": lambda: _table_3(answers, responses, place, level),
         "IV": lambda: _table_4(table, sources, roles, level),
     }
     for number, make in makers.items():
@@ -94,21 +99,23 @@ def set_sources(table: pd.DataFrame, sets: pd.DataFrame | None) -> tuple[dict[st
     return {name: str(sets.at[name, "source"]) for name in used}, {name: str(roles[name]) for name in used}
 
 
-def _table_2(answers: pd.DataFrame, responses: Sequence[str], level: float) -> Regression:
-    """Table II: logit of the highest response on whether the set was best. Raises InputError if no best set was
+def _table_2(answers: pd.DataFrame, goal: str, level: float) -> Regression:
+    """Table II: logit of the goal on whether the set was best. Raises InputError if no best set was
     classified."""
     _need(answers, ("best",))
-    close = (answers["class"] == responses[-1]).astype(int)
+    close = (answers["class"] == goal).astype(int)
     best = {"Best": (answers["set"] == "best").astype(float)}
     return binary_logit(close, best, answers[["participant"]], level=level)
 
 
-def _table_3(answers: pd.DataFrame, responses: Sequence[str], level: float) -> Regression:
-    """Table III: ordered logit of the class on best and worst. Raises InputError if best, mid or worst was never
-    classified."""
+def _table_3(answers: pd.DataFrame, responses: Sequence[str], goal: int, level: float) -> Regression:
+    """Table III: ordered logit of the class, from the one with the index `goal`, on best and worst. Raises InputError
+    if best, mid or worst was never classified."""
     _need(answers, ROLES)
     shifts = {name.capitalize(): (answers["set"] == name).astype(float) for name in ("best", "worst")}
-    ranks, names = len(responses) - 1 - answers["category"], list(responses)[::-1]
+    far = [abs(place - goal) for place in range(len(responses))]
+    ranks = (answers["category"] - goal).abs()
+    names = [" or ".join(r for r, at in zip(responses, far, strict=True) if at == rank) for rank in range(max(far) + 1)]
     return ordered_logit(ranks, shifts, answers[["participant"]], categories=names, level=level)
 
 

@@ -9,6 +9,7 @@ import equinox as eqx
 
 from hilbo.errors import InputError
 from hilbo.kernels import Levels
+from hilbo.likelihoods import Goal
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
 from hilbo.population.learnt.posterior import NOTHING, Stated, every_theta, prior_model
 from hilbo.population.learnt.rule import Learnt
@@ -78,6 +79,23 @@ class Study(eqx.Module):
     def responses(self) -> tuple[str, ...]:
         """Labels of the responses, lowest first."""
         return self.file.responses
+
+    @property
+    def goal(self) -> Goal:
+        """The response that is searched for: `goal` of the file, or the highest."""
+        return Goal.of(self.file.responses, self.file.goal)
+
+    @property
+    def goal_label(self) -> str:
+        """Label of the goal."""
+        return self.responses[self.goal.category]
+
+    @property
+    def one_optimum(self) -> bool:
+        """Whether one stimulus is the best. With a goal between other responses and several parameters, those of a
+        curve or a surface are.
+        """
+        return not self.goal.is_between or self.space.dim == 1
 
     def material(self, name: str) -> "Study":
         """The study of one material: its overrides of [renderer] and [parameters] applied. Raises `InputError` for a

@@ -5,7 +5,7 @@
     validation*.csv   optional: validation tables
     sets*.csv         optional: sets tables; a set of source "sysid" is the reference of tables and figures
     truth.csv         optional, of a simulated study: the true parameters, in a row of `source` "population"
-    plan.json         optional: the plan of `hilbo plan`, with which the sessions are compared
+    plan.json         optional: the plan of `hilbo plan`, or several as plan-*.json, with which sessions are compared
 
 The folder of `hilbo export` is one: its data/ holds trials, validation, sets, and sessions (for the plan) by the names
 of a Psych-DS. A study of several materials names them in [materials.NAME] (which overrides the renderer or parameters)
@@ -25,15 +25,29 @@ from jaxtyping import Float
 from hilbo.errors import InputError, warn_caller
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
-from hilbo.study.departures import PHASE, Held, departures
+from hilbo.study.departures import changed_files, departures
 from hilbo.study.file.plan_file import read_plan
 from hilbo.study.file.trial_flags import FlagCounts, flag_sentences
 from hilbo.study.formats.csv_file import cell_pieces, numbers, parameter_values, read_cells
 from hilbo.study.tables.flag_counts import flag_counts
+from hilbo.study.tables.sessions import Held, read_held
 from hilbo.study.tables.trials import NothingToFitError, TrialTable, check_texts, joined, trial_table
 from hilbo.study.tables.validation import check_validation, sets_frame
 
-__all__ = ["Material", "StudyFolder", "read_folder"]
+__all__ = ["Material", "Reference", "StudyFolder", "read_folder"]
+
+
+class Reference(NamedTuple):
+    """The set that optima are compared with: system identification, or the truth of a simulated study.
+
+    `x`: in the unit cube; `name`: in words; `low` and `high`: ends of the 95 % intervals of its parameters, where the
+    identification has them for all.
+    """
+
+    x: Float[np.ndarray, " d"]
+    name: str
+    low: Float[np.ndarray, " d"] | None = None
+    high: Float[np.ndarray, " d"] | None = None
 
 
 class Material(NamedTuple):
@@ -44,15 +58,13 @@ class Material(NamedTuple):
     study: Study
     cohort: Cohort
     validation: pd.DataFrame | None
-    reference: Float[np.ndarray, " d"] | None
-    """System-identification set, or truth of a simulated study, in the unit cube; None if there is none."""
-    reference_name: str
+    reference: Reference | None
     flags: FlagCounts = FlagCounts()
     """Counts of trials with a flag of the device, and of those excluded for it."""
 
 
 class StudyFolder(NamedTuple):
-    """The checked content of a folder."""
+    """The checked content of a folder. `sessions`: those of an export, None if there is no such table."""
 
     study: Study
     materials: list[Material]
@@ -61,6 +73,7 @@ class StudyFolder(NamedTuple):
     """Sentences: deviations from the plan, and information that the tables lack."""
     notes: tuple[str, ...] = ()
     """Sentences: confirmation of the plan, and flags of comparisons."""
+    sessions: list[Held] | None = None
 
 
 def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
@@ -93,10 +106,11 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     }
     _check_materials_named(names, tables)
     materials = [_material(name, study, cells, compared, sets, truth) for name in names]
-    departs, as_planned = _departures(folder, study, materials)
-    limits = (*departs, *_missing_tables(study, materials, compared, sets))
+    held = read_held(folder)
+    departs, as_planned = _departures(folder, study, materials, held)
+    limits = (*departs, *changed_files(held or ()), *_missing_tables(study, materials, compared, sets))
     flags = flag_sentences(flag_counts(*validation), study.file.exclude_flags, "comparisons") if validation else []
-    return StudyFolder(study, materials, sets, limits, (*as_planned, *flags))
+    return StudyFolder(study, materials, sets, limits, (*as_planned, *flags), held)
 
 
 def _with_exclusion(study: Study, exclude: str | None) -> Study:
@@ -194,10 +208,10 @@ def _material(
     _check_answers_once(table.rows, next(iter(tables)))
     if compared is not None and name and "material" in compared:
         compared = compared[compared["material"] == name]
-    reference, words = _reference(material_study, name, sets, truth)
+    reference = _reference(material_study, name, sets, truth)
     validation = None if compared is None or compared.empty else compared
     cohort = cohort_of(table, material_study)
-    return Material(name, material_study, cohort, validation, reference, words, table.flags)
+    return Material(name, material_study, cohort, validation, reference, table.flags)
 
 
 def _answers(name: str, study: Study, tables: Mapping[Path, list[pd.DataFrame]]) -> TrialTable:
@@ -249,55 +263,60 @@ def _read_truth(path: Path, study: Study) -> pd.DataFrame:
     )
 
 
-def _reference(
-    study: Study, name: str, sets: pd.DataFrame | None, truth: pd.DataFrame | None
-) -> tuple[Float[np.ndarray, " d"] | None, str]:
-    """Reference point (d,) in the unit cube and its name: the sets table's system identification, otherwise the
-    simulation's truth. (None, "") if neither has exactly one row with finite numbers. Raises InputError for several
-    rows of one material."""
+def _reference(study: Study, name: str, sets: pd.DataFrame | None, truth: pd.DataFrame | None) -> Reference | None:
+    """Reference of a material: the sets table's system identification, otherwise the simulation's truth. None if
+    neither has exactly one row with finite numbers. Raises InputError for several rows of one material."""
+    names = list(study.space.names)
     for table, source, words in ((sets, "sysid", "system identification"), (truth, "population", "the truth")):
         rows = _rows_of_source(table, source)
         if rows is None:
             continue
         rows = rows[rows["material"] == name] if name and "material" in rows else rows
-        if len(rows) == 1 and np.isfinite(rows[list(study.space.names)].to_numpy(float)).all():
-            physical = rows[list(study.space.names)].to_numpy(float)[0]
-            return np.asarray(study.space.to_unit(physical)), words
+        if len(rows) == 1 and np.isfinite(rows[names].to_numpy(float)).all():
+            ends = [_end(study, rows, end) for end in ("low", "high")]
+            return Reference(np.asarray(study.space.to_unit(rows[names].to_numpy(float)[0])), words, *ends)
         if len(rows) > 1:
             raise InputError(
                 f'there are {len(rows)} sets of source "{source}" for material "{name}"; keep one, or add a'
                 ' column "material".'
             )
-    return None, ""
+    return None
 
 
-def _departures(folder: Path, study: Study, materials: list[Material]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Compare the sessions with plan.json; returns (sentences on deviations, sentences that confirm the plan), one of
-    them empty; both without a plan. Responses excluded for their flags are counted too. Raises InputError."""
-    path = folder / "plan.json"
-    if not path.exists():
-        return (), ()
-    counts: dict[str, list[int]] = {}
+def _end(study: Study, row: pd.DataFrame, end: str) -> Float[np.ndarray, " d"] | None:
+    """Lower or upper ends of the intervals of a reference's parameters (columns PARAMETER_low, PARAMETER_high), in the
+    unit cube; None if one of them is missing or, on a logarithmic scale, not positive. Raises InputError for an end on
+    the wrong side of its value."""
+    columns = [f"{name}_{end}" for name in study.space.names]
+    if not set(columns) <= set(row) or not np.isfinite(row[columns].to_numpy(float)).all():
+        return None
+    ends, values = row[columns].to_numpy(float)[0], row[list(study.space.names)].to_numpy(float)[0]
+    wrong = ends > values if end == "low" else ends < values
+    if wrong.any():
+        name = study.space.names[int(wrong.argmax())]
+        raise InputError(f'the set of source "sysid" has a {name}_{end} on the wrong side of its {name}; correct it.')
+    if any(p.scale == "log" and value <= 0 for p, value in zip(study.space.parameters, ends, strict=True)):
+        return None
+    return np.asarray(study.space.to_unit(ends))
+
+
+def _departures(
+    folder: Path, study: Study, materials: list[Material], held: list[Held] | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Compare the sessions with the plans in plan.json or plan-*.json; returns (sentences on deviations, sentences that
+    confirm a plan); both are empty without a plan. Responses excluded for their flags are counted too. Raises
+    InputError."""
+    plans = {path: read_plan(path) for path in sorted([*folder.glob("plan.json"), *folder.glob("plan-*.json")])}
+    for path, plan in plans.items():
+        meanings = [(study.file.material(name) if name else study.file).meaning for name in plan.materials]
+        if list(plan.meaning) != meanings:
+            raise InputError(f"{path}: is the plan of another study ({plan.study}); remove it from the folder.")
+    counts: dict[str, dict[str, int]] = {}
     for material in materials:
         answers = Counter(dict(zip(material.cohort.names, material.cohort.counts().tolist(), strict=True)))
         for name, count in (answers + Counter(material.flags.excluded)).items():
-            counts.setdefault(name, []).append(count)
-    return departures(read_plan(path), study.file.hash, study.file.selection.trials, counts, _session_plans(folder))
-
-
-def _session_plans(folder: Path) -> list[Held] | None:
-    """Sessions of the optimisation phase with the plan that each followed, read from an export's data/; None if there
-    is no table of sessions. Raises InputError."""
-    paths = sorted((folder / "data").glob("*_table-sessions_data.csv"))
-    held = []
-    for path in paths:
-        cells = read_cells(path, "a table of sessions needs a header and a session")
-        missing = [name for name in (*Held._fields, "phases") if name not in cells]
-        if missing:
-            raise InputError(f'{path}:1: column "{missing[0]}" is missing; export the logs again.')
-        here = cells[[PHASE in phases.split(", ") for phases in cells["phases"]]]
-        held += [Held(*row) for row in here[list(Held._fields)].itertuples(index=False)]
-    return held if paths else None
+            counts.setdefault(name, {})[material.name] = count
+    return departures(list(plans.values()), counts, held, study.file.hash)
 
 
 def _missing_tables(

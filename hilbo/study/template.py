@@ -40,6 +40,8 @@ class NewStudy(NamedTuple):
     trials: int = 25
     device: bool = False
     by: Literal["program", "person"] = "program"
+    goal: str = ""
+    """The response that is searched for; empty for the highest."""
     constraints: tuple[str, ...] = ()
     """Such as `a + 2*b <= 3`, in the parameters' units."""
 

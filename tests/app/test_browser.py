@@ -114,6 +114,17 @@ def until_answered(participant, count):
         time.sleep(0.02)
 
 
+def until_asked(participant):
+    """Waits for a question, and presses Begin meanwhile: on a busy computer the session may be interrupted, as when a
+    laptop slept."""
+    end = time.monotonic() + PATIENCE
+    while not participant.window.is_visible("#options"):
+        if participant.window.is_visible("#go"):
+            participant.window.evaluate("press('begin')")
+        assert time.monotonic() < end, participant.phase
+        participant.window.wait_for_timeout(20)
+
+
 def test_every_button_of_the_experimenter_is_an_event(pages):
     live, participant, experimenter = pages
     until_answered(participant, 1)
@@ -122,9 +133,9 @@ def test_every_button_of_the_experimenter_is_an_event(pages):
     press(experimenter, "resume")
     experimenter.fill("#note-text", "yawned")
     experimenter.keyboard.press("Enter")
-    participant.window.wait_for_selector("#options:visible")
+    until_asked(participant)
     press(experimenter, "repeat")
-    participant.window.wait_for_selector("#options:visible")
+    until_asked(participant)
     press(experimenter, "undo", "slipped")
     until_answered(participant, 2)
     press(experimenter, "void", "noise")
@@ -271,7 +282,7 @@ def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
     live, participant, _ = pages
     window = participant.window
     until_answered(participant, 1)
-    window.wait_for_selector("#options:visible")
+    until_asked(participant)
     window.route("**/api/participant/answer", lambda route: route.abort())  # sent, never arrives
     trial = window.evaluate("trial")
     for _ in range(3):
@@ -286,10 +297,7 @@ def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
     window.wait_for_selector("#options:visible, #go:visible")
     window.route("**/api/participant/answer", lambda route: (route.fetch(), route.abort()))  # arrives, answer lost
     count = len(live.events("answer"))
-    while not window.is_visible("#options"):
-        if window.is_visible("#go"):
-            window.click("#go")  # which counts when it has stood there for a moment
-        window.wait_for_timeout(50)
+    until_asked(participant)
     for _ in range(3):
         press_key(window, "2")
     until_logged(live, window, count + 1)
@@ -398,6 +406,7 @@ def test_a_tap_at_the_moment_when_answers_come_up_is_none(pages):
         " if (b) { window.tapped = (window.tapped || 0) + 1; b.click(); } })"
         ".observe(document.getElementById('options'), {childList: true})"
     )
+    until_asked(participant)
     until(window, "window.tapped > 0 && document.body.dataset.phase === 'answer'")
     assert len(live.events("answer")) == 1
     window.wait_for_timeout(400)
@@ -410,7 +419,7 @@ def test_a_key_that_a_remote_desktop_doubles_is_marked(pages):
     live, participant, experimenter = pages
     window = participant.window
     until_answered(participant, 1)  # by a person: at a time of their own
-    window.wait_for_selector("#options:visible")
+    until_asked(participant)
     for after in (900, 310, 900):
         window.evaluate(f"laidOut = performance.now() - {after}; choose(0)")
     until_logged(live, window, 2)
@@ -454,7 +463,7 @@ def test_answers_by_the_places_of_a_french_keyboard(pages):
     until_answered(participant, 1)
     until_logged(live, participant.window, 1)
     window = participant.window
-    window.wait_for_selector("#options:visible")
+    until_asked(participant)
     for key, code in [("End", "Numpad1"), ("a", "KeyQ"), ("Dead", "Digit2")]:
         french(window, key, code)
     window.wait_for_timeout(300)

@@ -104,7 +104,7 @@ def test_a_study_is_made_fast_whether_it_has_steps_or_not(tmp_path):
             assert {step.seconds for step in protocol(session, phase).steps} == {0.1}
 
 
-def test_a_session_is_resumed_only_with_its_own_study_and_never_begun_twice(tmp_path):
+def test_a_session_is_resumed_only_with_its_own_study_and_never_begun_twice(tmp_path, monkeypatch, capsys):
     study_of(tmp_path)
     file, logs = tmp_path / "study.toml", tmp_path / "logs"
     logs.mkdir()
@@ -117,8 +117,10 @@ def test_a_session_is_resumed_only_with_its_own_study_and_never_begun_twice(tmp_
     log.close()
     with pytest.raises(InputError, match="--resume"):
         opened(wanted, lambda *_: None, lambda *_: None)
-    with pytest.raises(InputError, match="another study"):
-        opened(wanted._replace(resume=True, study=DATA), lambda *_: None, lambda _: None)
+    other = tmp_path / "other.toml"
+    other.write_text(DATA.read_text().replace('"close"]', '"near"]'))
+    with pytest.raises(InputError, match=r"another study .* they differ in study\.responses"):
+        opened(wanted._replace(resume=True, study=other), lambda *_: None, lambda _: None)
     text = log.path.read_bytes()
     log.path.write_bytes(text.replace(b"P01", b"P02", 1))
     with pytest.raises(InputError, match="damaged"):
@@ -128,6 +130,10 @@ def test_a_session_is_resumed_only_with_its_own_study_and_never_begun_twice(tmp_
     log.close()
     assert again.tag == hub.tag
     assert again.state == hub.state
+    capsys.readouterr()
+    file.write_text(file.read_text() + '[session.texts]\nhello = "Good morning"\n')
+    served(monkeypatch, file, "--logs", logs, "--port", 0, "--participant", "P01", "--resume")
+    assert "as when the session began; now it differs in session.texts.hello\n" in capsys.readouterr().err
 
 
 def served(monkeypatch, *arguments):

@@ -10,6 +10,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
+from live import Driver, beginning
 from live_server import Live, ask, refused
 
 from hilbo.app.hub.hub import Hub
@@ -242,7 +243,11 @@ class Disk:
 
     def __init__(self, full):
         self.full, self.written, self.begun = full, [], True
-        self.state = SimpleNamespace(pending=SimpleNamespace(id=1, unfinished=True), trial=lambda _: None, seq=0)
+        driver = Driver()
+        driver.step()
+        for event in beginning(driver.state, 1, 0, 0.0):
+            driver.log(event)
+        self.state = driver.state
         self.runner = SimpleNamespace(restart=lambda: None, wake=lambda: None, forget=lambda: None)
 
     def publish(self):

@@ -14,6 +14,8 @@ from hilbo.identification.fitting import Test
 from hilbo.report.figures.mechanics import passivity_figure
 from hilbo.report.passivity import passivity_result
 from hilbo.study.config import Study
+from hilbo.study.folder import _reference
+from hilbo.study.tables.validation import sets_frame
 from hilbo.viscoelastic import FOSLS
 
 STUDY = "hilbo/data/paper.toml"
@@ -135,6 +137,12 @@ def test_identify_writes_everything(capsys, monkeypatch, tmp_path):
     before, _, rest = text.partition("[renderer]")
     study = Study.from_dict(tomllib.loads(before + content["renderer"] + rest[rest.index("[gp]") :]))
     assert study.space.mechanics.K_eff == pytest.approx(0.44325, abs=2e-3)
+    sets = sets_frame(out / "sets.csv", study.space.names, study.space.parameters)
+    reference = _reference(study, "", sets, None)
+    for name, place, low, high in zip(study.space.names, reference.x, reference.low, reference.high, strict=True):
+        row = content["parameters"][name]
+        assert sets.at["sysid", name] == content["set"][name] and sets.at["sysid", f"{name}_low"] == row["lower"]
+        assert low < place < high
     page = " ".join((out / "report.html").read_text().split())
     assert page.count("data:image/png;base64,") == 5
     assert "http://" not in page and "https://" not in page and "N·sᵅ/mm" in page

@@ -129,7 +129,8 @@ def a_result(study, **changes):
         {"participant": f"P0{i}", "trials": 6, "optimum": {"parameters": {"u": 0.2, "v": 0.1 * i}}} for i in (1, 2)
     ]
     optimum = {"parameters": {"u": 0.3, "v": 0.6}, "mean": 1.0}
-    return {"optimum": optimum, "participants": people, "study": study.file.hash, "seed": 0} | changes
+    hashes = {"study": study.file.hash, "meaning": study.file.meaning, "goal": study.goal_label}
+    return {"optimum": optimum, "participants": people, **hashes, "seed": 0} | changes
 
 
 def test_nobody_is_given_a_row_to_validate_a_map_that_they_are_in(hilbo, tmp_path):
@@ -297,7 +298,7 @@ def test_a_report_reads_the_folder_of_an_export(hilbo, tmp_path):
     folder = read_folder(tmp_path / "tables")
     (material,) = folder.materials
     assert material.cohort.names == ("P02",) and len(material.validation) == 6
-    assert set(folder.sets.index) == {*"DEF", "measured"} and material.reference_name == "system identification"
+    assert set(folder.sets.index) == {*"DEF", "measured"} and material.reference.name == "system identification"
     assert any("P01" in sentence for sentence in folder.limits)  # the plan is looked at
     assert any(
         sentence.endswith("Held by no plan: P02 (session 1).") for sentence in folder.limits
@@ -319,13 +320,13 @@ def test_sessions_of_the_plan_that_is_exported_with_them_depart_from_nothing(hil
     code, _, err = hilbo("export", "logs", "--study", "study.toml", "--plan", "fixed.json", "--out", "tables")
     assert code == 0, err
     (note,) = read_folder(tmp_path / "tables").notes
-    assert note.endswith("their sessions were held by it.")
+    assert note.endswith("all sessions followed it.")
     table = tmp_path / "tables" / "data" / "study-plain_table-sessions_data.csv"
     table.write_text(table.read_text().replace(plan["hash"], "0" * 16, 1))
     folder = read_folder(tmp_path / "tables")
     assert not folder.notes and any(f"P01 (session 1, plan {'0' * 16})" in sentence for sentence in folder.limits)
     table.write_text("participant,session\nP01,1\n")
-    with pytest.raises(InputError, match=r'sessions_data\.csv:1: column "plan" is missing'):
+    with pytest.raises(InputError, match=r'sessions_data\.csv:1: column "phases" is missing'):
         read_folder(tmp_path / "tables")
 
 

@@ -71,6 +71,27 @@ def test_the_scale_freedom_is_real_and_refused():
     del d
 
 
+@jax.jit
+def maximum_with_thresholds(gp, trials):
+    """Compiled once for all units."""
+    return hyper.maximise_evidence(gp, trials, ("theta", "noise", "thresholds"), weak_priors=True)
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize("unit", [1e-3, 30.0, 1e4])
+def test_the_unit_of_f_does_not_matter(unit):
+    """f, thresholds and noise times `unit`: the same search, step by step."""
+    d, gp, trials = problem(three)
+    likelihood = OrdinalProbit(unit * gp.likelihood.thresholds, unit * gp.likelihood.noise)
+    scaled = OrdinalGP(RBF(gp.kernel.theta, unit**2 * gp.kernel.variance), likelihood)
+    here, there = maximum_with_thresholds(gp, trials), maximum_with_thresholds(scaled, trials)
+    assert bool(here.converged) and bool(there.converged) and not bool(there.runaway)
+    assert float(there.log_evidence) == pytest.approx(float(here.log_evidence), rel=1e-10)
+    assert float(there.gp.kernel.theta) == pytest.approx(float(here.gp.kernel.theta), rel=1e-6)
+    np.testing.assert_allclose(there.gp.likelihood.thresholds, unit * here.gp.likelihood.thresholds, rtol=1e-5)
+    del d
+
+
 def assert_unmoved(maximum, gp):
     assert float(maximum.log_evidence) == 0.0 and bool(maximum.runaway)
     assert maximum.gp.kernel.theta == pytest.approx(float(gp.kernel.theta), rel=1e-12)

@@ -9,6 +9,7 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
 from hilbo.kernels import Matern32
+from hilbo.population.learnt import rule, search
 from hilbo.population.learnt.posterior import KERNELS, NOTHING, Stated, medians, model_at, prior_model
 from hilbo.population.learnt.rule import drawn_maps, learn, learnt_function
 from hilbo.population.learnt.search import first_search, searched
@@ -209,3 +210,27 @@ def test_widths_are_found_where_people_have_them():
     assert end.gains["widths"] > 3
     widths = np.asarray(end.coordinates["widths"])
     assert widths[1::2].min() > widths[::2].max() + 0.5
+
+
+@pytest.mark.deep
+def test_features_that_are_too_few_for_the_noise_are_noticed_and_more_are_taken(monkeypatch):
+    """People almost without noise: 32 features leave a few percent of the variance, and shift the hyperparameters."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(size=(8, 24, 2))
+    felt = np.sin(9 * x[..., 0]) + np.cos(8 * x[..., 1]) + 0.02 * rng.standard_normal((8, 24))
+    q = jnp.asarray((felt > -0.4).astype(int) + (felt > 0.5))
+    trials = jax.vmap(Trials)(jnp.asarray(x), q, jnp.ones((8, 24), bool))
+    enough = learn(trials, 3, recipe=LEARNT_2)
+    monkeypatch.setattr(search, "LARGEST", 32)
+    monkeypatch.setattr(rule, "LARGEST", 32)
+    few = learn(trials, 3, recipe=LEARNT_2)
+    assert int(enough.rank) == int(few.rank) > 32 and bool(few.converged)
+    assert off(few, enough) < 0.25
+    monkeypatch.setattr(rule, "_MOST_FEATURES", 32)
+    rough = learn(trials, 3, recipe=LEARNT_2)
+    assert not bool(rough.converged) and off(rough, enough) > 1.0
+
+
+def off(learnt, other):
+    """Largest difference of a hyperparameter, in the other's posterior standard deviations."""
+    return max(float(np.max(np.abs(learnt.coordinates[k] - v) / other.sd[k])) for k, v in other.coordinates.items())

@@ -15,7 +15,7 @@ from scipy.stats import norm
 from studies import plain
 
 from hilbo import Trials
-from hilbo.likelihoods import OrdinalProbit
+from hilbo.likelihoods import Goal, OrdinalProbit
 from hilbo.population import newcomer
 from hilbo.population.maps import RuleMap, point_rule
 from hilbo.population.rules.registry import POINTWISE
@@ -26,7 +26,7 @@ from hilbo.report.figures.maps import Slice
 from hilbo.study.analysis import analysis
 from hilbo.study.analysis.heterogeneity import how_aggregated
 from hilbo.study.analysis.progress import _map_by_points
-from hilbo.study.analysis.tolerance_intervals import _dominant_in_draws
+from hilbo.study.analysis.tolerance import _dominant_in_draws
 from hilbo.study.cohort import Cohort
 from hilbo.study.estimate.aggregate import Aggregate, fit_cohort
 from hilbo.study.estimate.optimum import map_optimum, predict_people
@@ -146,7 +146,8 @@ def test_what_a_map_does_not_know_is_hatched(prior, hatched):
 
 LIKELIHOOD = OrdinalProbit(jnp.array([-0.5, 0.2, 1.3]), jnp.asarray(0.8))
 MEAN, VARIANCE = jnp.array([0.3, -1.0, 4.0]), jnp.array([0.2, 0.5, 2.0])
-class_probabilities, log_highest = map(eqx.filter_jit, (newcomer.class_probabilities, newcomer.log_highest))
+HIGHEST = Goal.highest(LIKELIHOOD.categories)
+class_probabilities, log_goal = map(eqx.filter_jit, (newcomer.class_probabilities, newcomer.log_goal))
 
 
 WIDTHS, WIDE = ScaleUse(jnp.asarray(0.4)), ScaleUse(sensitivity=jnp.asarray(0.8))
@@ -183,12 +184,16 @@ def test_the_use_of_the_scale_is_integrated_out(scale):
 @pytest.mark.parametrize("scale", [None, WIDTHS, SENSITIVITY, BOTH])
 def test_the_highest_category_is_the_last_one(scale):
     chances = np.asarray(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, scale))
-    np.testing.assert_allclose(np.exp(log_highest(LIKELIHOOD, MEAN, VARIANCE, scale)), chances[:, -1], rtol=1e-12)
+    np.testing.assert_allclose(
+        np.exp(log_goal(LIKELIHOOD, HIGHEST, MEAN, VARIANCE, scale)),
+        chances[:, -1],
+        rtol=1e-12,
+    )
 
 
 def test_the_highest_category_far_below():
     """Its logarithm stays finite, and so does its slope, where the probability is 0 in double precision."""
-    height = jax.jit(jax.value_and_grad(lambda m: newcomer.log_highest(LIKELIHOOD, m, jnp.zeros(1))[0]))
+    height = jax.jit(jax.value_and_grad(lambda m: newcomer.log_goal(LIKELIHOOD, HIGHEST, m, jnp.zeros(1))[0]))
     value, slope = height(jnp.array([-60.0]))
     np.testing.assert_allclose(value, norm.logcdf((-60.0 - 1.3) / 0.8), rtol=1e-12)
     assert np.isfinite(slope).all() and slope[0] > 0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from datasets import SMALL
 from helpers import model
-from scipy.stats import binomtest
+from scipy.stats import binomtest, chi2
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
@@ -69,6 +69,22 @@ def test_guesses_and_a_drift_are_told_apart(lapse, drift):
     assert (row["drift_high"] < -1.0, row["drift_low"] > 0.5) == (drift < 0, drift > 0)
 
 
+def test_an_interval_narrower_than_the_grid_is_that_of_a_fine_grid():
+    rng, gp = np.random.default_rng(3), OrdinalGP(RBF(1.0, 1.0), OrdinalProbit((-0.5, 0.5), 0.02))
+    x = rng.uniform(size=(60, 1)) * np.array([[1.0, 0.0, 0.0]])
+    score = np.sin(6.0 * x[:, 0]) + 1.3 * np.linspace(-0.5, 0.5, 60)
+    q = np.searchsorted(np.asarray(gp.likelihood.thresholds), score)
+    trials = jax.tree.map(lambda leaf: leaf[None], Trials.from_arrays(x, q))
+    (row,) = measure_people(gp, trials, ("A",)).to_dict("records")
+    grid = response_quality._DRIFTS
+    assert np.sum((grid >= row["drift_low"]) & (grid <= row["drift_high"])) < 4
+    fine = np.linspace(row["drift_low"] - 0.1, row["drift_high"] + 0.1, 42)
+    levelled = OrdinalGP(response_quality._Levelled(gp.kernel), gp.likelihood)
+    profile = np.asarray(response_quality._log_likelihoods(levelled, trials, jnp.asarray(fine))).max(axis=(0, 1))
+    within = fine[profile > profile.max() - chi2.ppf(0.95, 1) / 2]
+    np.testing.assert_allclose([row["drift_low"], row["drift_high"]], within[[0, -1]], atol=fine[1] - fine[0])
+
+
 def test_of_many_answers_an_even_part_is_measured(monkeypatch):
     gp, trials = person(26, 0.0, 0.0)
     monkeypatch.setattr(response_quality, "_MOST", 16)
@@ -83,7 +99,9 @@ def test_of_many_answers_an_even_part_is_measured(monkeypatch):
 def test_what_the_answers_do_not_tell_is_no_number():
     """Drifts make no difference to answers that are all guessed; and a lapse rate that may be any is none."""
     flat = np.full((18, 21), -30.0)
-    assert response_quality._drift(flat, 5) == pytest.approx((np.nan, -np.inf, np.inf), nan_ok=True)
+    assert response_quality._drift(response_quality._DRIFTS, flat, 5) == pytest.approx(
+        (np.nan, -np.inf, np.inf), nan_ok=True
+    )
     assert response_quality._lapse(flat, 5) == pytest.approx((np.nan, 0.0, 1.0), nan_ok=True)
     falls = flat - np.linspace(0.0, 4.0, 18)[:, None]  # from the lowest rate to the highest
     best, low, high = response_quality._lapse(falls, 5)

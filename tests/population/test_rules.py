@@ -49,12 +49,13 @@ def test_the_command_line_takes_it_and_names_it(rule):
 @each_rule
 def test_pages_describe_it(rule, tmp_path):
     assert estimate_words(rule.name, "another") == rule.label
-    assert "{" not in rule.place.format(top="close")
+    optimum = rule.optimum_for("close", True)
+    assert "{" not in optimum + rule.optimum_for("similar", False)
     path = tmp_path / "study.toml"
     path.write_text(PAPER.replace('rule = "bcm"', f'rule = "{rule.name}"'), encoding="utf-8")
     study = StudyFile.load(path)
     page = registration(study, make_plan(study, ["P01", "P02"], 0), "1.2.3")
-    assert f"{rule.description} (`{rule.name}`)" in page and rule.sought in page
+    assert f"{rule.description} (`{rule.name}`)" in page and optimum in page
     assert f'"{rule.name}"' in (PACKAGE.parent / "docs" / "guides" / "study-file.md").read_text(encoding="utf-8")
 
 

@@ -1,12 +1,16 @@
 """Marks of answers on maps: nothing that was answered is hidden by what else was answered at the same place."""
 
+from io import BytesIO
+
 import numpy as np
 import pandas as pd
+import pytest
 from matplotlib.figure import Figure
 from studies import population_study
 
 from hilbo.report.figures.answers import answer_handles, mark_along, mark_trials
 from hilbo.report.figures.maps import map_handles
+from hilbo.report.figures.style import ONE_COLUMN, legend, new_figure, plain, styled
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
 
@@ -91,3 +95,14 @@ def test_a_legend_has_contours_only_where_a_map_has_them():
         }
     )
     assert map_handles(study) == []
+
+
+@pytest.mark.parametrize(
+    "words", [("a", "b", "c"), ("too soft to be true", "as the real one, or nearly", "$5 too hard")]
+)
+def test_no_legend_is_wider_than_its_figure(words):
+    figure, axes = new_figure(ONE_COLUMN, 2.0)
+    handles = [axes.plot([0], [0], "o", label=plain(word))[0] for word in (*words, "mean", "standard\ndeviation")]
+    styled(legend)(figure, handles)
+    figure.savefig(BytesIO(), format="png")
+    assert figure.legends[0].get_window_extent().width <= figure.bbox.width

@@ -19,7 +19,7 @@ from hilbo.report.study.checklist import _model, _posterior
             "learnt-2",
             Matern32([5.86, 4.07], 5.4),
             "a Matérn 3/2 covariance",
-            "the place that the best one is most",
+            "the point that is most often near",
         ),
     ],
 )

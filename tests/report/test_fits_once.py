@@ -36,7 +36,7 @@ def test_report_fits_each_model_to_each_data_once(tmp_path, monkeypatch):
         both = fixed_and_optimised(study, cohort)
     assert searched and set(searched.values()) == {1}
     monkeypatch.setattr(analysis, "fixed_and_optimised", lambda study, cohort: both)
-    material = Material("", study, cohort, None, None, "")
+    material = Material("", study, cohort, None, None)
     with count_fits() as fits:
         write_study(StudyFolder(study, [material], None, ()), tmp_path)
     assert {key: count for key, count in fits.items() if count > 1} == {}

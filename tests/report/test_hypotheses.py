@@ -26,7 +26,7 @@ def test_a_tie_of_answers_says_nothing_whichever_way_the_scale_runs(counts, side
     """Best, mid and worst by the three answers, highest first; reversed, the worst set is the best."""
     for way in (1, -1):
         tables = SimpleNamespace(confusion=pd.DataFrame(np.array(counts)[::way, ::way]))
-        (item,) = _validation(SimpleNamespace(tables=tables, regressions=dict), plain().responses)
+        (item,) = _validation(SimpleNamespace(tables=tables, regressions=dict), plain())
         assert item.side == side
         assert item.text.endswith("of the cases (supports: each is the most frequent answer to its set).")
 

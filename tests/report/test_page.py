@@ -94,7 +94,11 @@ def robust(nrmse, resampled=MappingProxyType({"median": 0.02, "95 %": 0.025}), s
     """The page of a robustness check of two people, the second of whom moved."""
     study = plain_study(2)
     optimum = {"parameters": Rendering.at(study.space, np.full(2, 0.5)).shown, "mean": 1.0, "sd": 0.25}
-    optimum |= {"class_probabilities": {"no": 0.25, "yes": 0.75}, "near": {"answers": 7, "highest": 5}, "location": []}
+    optimum |= {
+        "class_probabilities": dict(zip(study.responses, (0.25, 0.75), strict=True)),
+        "near": {"answers": 7, "highest": 5},
+        "location": [],
+    }
     learned = {"parameters": ["theta", "noise"], "criterion": "the evidence", "gain": 12.3}
     learned |= {"theta": [5.0, 1 / 3], "variance": 1.0, "noise": 0.5, "thresholds": [0.0]}
     content = {

@@ -25,7 +25,7 @@ from hilbo.report.study.result_tables import alternatives_table
 from hilbo.session.export.tables import sets_table, trials_table
 from hilbo.simulation.simulate import to_table, truth_table
 from hilbo.simulation.validation_sessions import sets_table as simulated_sets
-from hilbo.study.analysis.tolerance import Sets
+from hilbo.study.analysis.best_mid_worst import Sets
 from hilbo.study.file.reserved_names import is_reserved
 from hilbo.study.results.map_netcdf import map_dataset
 from hilbo.trials import Trials

@@ -29,12 +29,12 @@ from hilbo.search.box import Parameter
 from hilbo.study.analysis.analysis import limits_of
 from hilbo.study.analysis.bootstrap import can_resample
 from hilbo.study.analysis.progress import Progress, _counts, _splits, _to_other_half
-from hilbo.study.analysis.tolerance import tolerance
-from hilbo.study.analysis.tolerance_intervals import tolerance_ends
+from hilbo.study.analysis.tolerance import tolerance, tolerance_ends
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.estimate.aggregate import fit_cohort
 from hilbo.study.estimate.optimum import predict_people
 from hilbo.study.file.reserved_names import is_reserved
+from hilbo.study.folder import Reference
 from hilbo.study.results.arviz_groups import groups, predictive_shares, write_groups
 from hilbo.study.template import NewStudy, study_text
 
@@ -112,19 +112,23 @@ def test_other_materials_are_the_others():
     study, validated = plain(), validate(paper_counts(np.random.default_rng(4), ties=20))
     optimum, own = SimpleNamespace(x=jnp.array([0.5, 0.5])), SimpleNamespace(x=jnp.array([[0.1, 0.5], [0.92, 0.5]]))
     analysis = SimpleNamespace(study=study, aggregate=SimpleNamespace(optimum=optimum, individuals=own))
-    parts = {"analysis": analysis, "reference_name": "the truth"}
+    parts = {"analysis": analysis}
     first, second, third = (
         SimpleNamespace(name=name, validated=asked, reference=reference, **parts)
-        for name, asked, reference in (("A", None, np.zeros(2)), ("B", validated, np.full(2, 0.5)), ("C", None, None))
+        for name, asked, reference in (
+            ("A", None, Reference(np.zeros(2), "the truth")),
+            ("B", validated, Reference(np.full(2, 0.5), "the truth")),
+            ("C", None, None),
+        )
     )
     items = list(_materials([first, second, third]))
-    assert [item.text[0] for item in items] == ["B", "B", "C"] and [i.side for i in items] == [
-        "supports",
-        "supports",
-        "inconclusive",
-    ]
+    near, *staged, preferred, nothing = items
+    assert [item.text[0] for item in items] == [*"B" * (len(items) - 1), "C"] and nothing.side == "inconclusive"
+    assert near.side == preferred.side == "supports"
+    tables = [item.text.split(",")[0] for item in staged]
+    assert tables[-3:] == ["B: Table II", "B: Table III", "B: Table III"]
     assert items[0].text.endswith("on average (supports: an interval above 0).")
-    assert "76.6 % of the decided comparisons (20 ties;" in items[1].text
+    assert "76.6 % of the decided comparisons (20 ties;" in preferred.text
     assert [item.side for item in _materials([first])] == ["inconclusive"]
 
 

@@ -24,7 +24,7 @@ from hilbo.report.validation import (
 )
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.validation_sessions import sets_table, validation_table
-from hilbo.study.analysis.tolerance import Sets
+from hilbo.study.analysis.best_mid_worst import Sets
 
 COLUMNS = ["participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred"]
 

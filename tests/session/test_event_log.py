@@ -159,7 +159,7 @@ def test_missing_swapped_and_forged_lines_are_refused(tmp_path, driven):
 def test_another_study_another_writer_and_other_files_are_refused(tmp_path, driven):
     path = tmp_path / "log.jsonl"
     write(path, driven)
-    other = Study.from_dict(RAW | {"gp": RAW["gp"] | {"theta": 11.0}})
+    other = Study.from_dict(RAW | {"study": RAW["study"] | {"attribute": "softness"}})
     with pytest.raises(InputError, match="is the log of another study"):
         EventLog.resume(path, other.file)
     with pytest.raises(InputError, match="exists already"):

@@ -73,7 +73,7 @@ def test_the_table_of_sessions_has_the_pauses(driver):
         driver.do("feel", 0)
         driver.do("answer", 0)
     assert [pause.seconds for pause in driver.state.pauses] == [600.0, 7_200.0]
-    table = sessions_table([driver.state, other.state])
+    table = sessions_table([driver.state, other.state], driver.state.study)
     assert table["pauses"].tolist() == [2, 0] and table["longest_pause"].tolist() == [7_200.0, 0.0]
     assert driver.state.pauses[-1] == Pause(driver.state.pauses[-1].seq, 5, 7_200.0)
 

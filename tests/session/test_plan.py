@@ -16,7 +16,9 @@ from hilbo.errors import InputError
 from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.log import actions as live
 from hilbo.session.log.header import header_for, material_seed, warm_up
+from hilbo.session.log.records import Trial
 from hilbo.session.log.state import LiveSession
+from hilbo.session.plan.counterbalance import assigned
 from hilbo.session.plan.plan import make_plan, planned_header, reissue
 from hilbo.session.plan.validation_sets import aggregate_best_sets, check_participants, validation_sets
 from hilbo.study.cohort import cohort_of
@@ -26,6 +28,7 @@ from hilbo.study.results.result_json import FoundOptimum, FoundPerson, Result, r
 
 PEOPLE = [f"P{i:02d}" for i in range(1, 9)]
 SETS = {name: {"u": 0.1 + 0.3 * i, "v": 0.9 - 0.2 * i} for i, name in enumerate(("best", "mid", "worst"))}
+OTHER = Study.from_dict(RAW | {"study": RAW["study"] | {"attribute": "softness"}})
 MATERIALS = Study.from_dict(RAW | {"materials": {"foam": {}, "soft": {}, "hard": {}}})
 
 
@@ -62,7 +65,7 @@ def test_a_changed_plan_another_study_and_strangers_are_refused(tmp_path):
     with pytest.raises(InputError, match="names a participant twice"):
         written(tmp_path, twice)
     with pytest.raises(InputError, match="belongs to another study"):
-        planned_header(plan, MATERIALS.file, "P01")
+        planned_header(plan, OTHER.file, "P01")
     with pytest.raises(InputError, match='participant "P99" is not in the plan'):
         planned_header(plan, STUDY.file, "P99")
     for content in ({}, json.loads(plan_text(plan)) | {"notes": ""}):
@@ -178,6 +181,90 @@ def test_a_row_is_reissued_with_its_order_and_seed():
         reissue(plan, "P99", "P30")
 
 
+GROUPS = {"materials": {"foam": {}, "soft": {}, "hard": {}}, "plan": {"people": {"foam": 6, "soft": 2, "hard": 2}}}
+GROUPED = Study.from_dict(RAW | GROUPS)
+
+
+def materials_of(plan):
+    return [[block.material for block in row.header.blocks if block.phase != "warm-up"] for row in plan.participants]
+
+
+def test_each_participant_is_assigned_to_one_material_at_random_in_the_planned_numbers():
+    people = [f"P{i:02d}" for i in range(10)]
+    plans = [make_plan(GROUPED.file, people, seed) for seed in range(3)]
+    for plan in plans:
+        rows = materials_of(plan)
+        assert all(len(row) == 1 for row in rows)
+        for half in (rows[:5], rows[5:]):  # blocks of five, as the numbers' ratio is 3 : 1 : 1
+            assert sorted(row[0] for row in half) == ["foam", "foam", "foam", "hard", "soft"]
+        assert plan.complete and plan.materials == ("foam", "soft", "hard")
+    groups = GROUPS["plan"]["people"]
+    drawn = [tuple(assigned(groups, seed)) for seed in range(300)]
+    assert materials_of(plans[2]) == [[name] for name in drawn[2]] and len(set(drawn)) > 100
+    firsts = [names[0] for names in drawn]
+    assert abs(firsts.count("foam") / 300 - 0.6) < 4 * (0.6 * 0.4 / 300) ** 0.5
+    assert plans[2] == make_plan(GROUPED.file, people, 2)
+    with pytest.raises(InputError, match=r"there are 9 participants, and \[plan\] people of the study file has 10"):
+        make_plan(GROUPED.file, people[:9], 0)
+    assert materials_of(make_plan(GROUPED.file, ["P99"], 0, materials=["soft"])) == [["soft"]]
+
+
+@pytest.mark.parametrize(
+    ("people", "sentence"),
+    [
+        (
+            {"foam": 6, "stone": 1},
+            r"plan\.people\.stone is of no material of the study, its materials: foam, soft, hard",
+        ),
+        ({"foam": 0}, r"plan\.people is .* must be a table of materials and numbers of participants"),
+        ({"foam": 1.5}, r"plan\.people is .* must be a table of materials and numbers of participants"),
+    ],
+)
+def test_wrong_numbers_of_people_are_refused(people, sentence):
+    with pytest.raises(InputError, match=sentence):
+        Study.from_dict(RAW | GROUPS | {"plan": {"people": people}})
+
+
+def test_materials_have_protocols_of_their_own():
+    tables = GROUPS | {
+        "materials": {
+            "foam": {"session": {"aggregate_best": {"count": 1}}},
+            "soft": {"session": {"aggregate_best": {"count": 3, "rest": 300.0}}},
+            "hard": {"session": {"validation": {"steps": [{"show": s, "seconds": 2} for s in ("a", "neutral", "b")]}}},
+        }
+    }
+    study = Study.from_dict(RAW | tables)
+    assert study.file.meaning == GROUPED.file.meaning and study.file.hash != GROUPED.file.hash
+    own = {"aggregate": SETS["best"], "individual:P01": SETS["mid"], "individual:P02": SETS["worst"]}
+    plan = make_plan(study.file, ["A1"], 0, "aggregate-best", sets=dict.fromkeys(study.file.materials, own))
+    blocks = {block.material: block for block in plan.participants[0].header.blocks[1:]}
+    assert {name: block.count for name, block in blocks.items()} == {"foam": 2, "soft": 6, "hard": 4}
+    assert {block.rest for block in plan.participants[0].header.blocks[2:]} <= {300.0, 600.0}
+    named = dict.fromkeys(study.file.materials, SETS)
+    plan = make_plan(study.file, ["V1"], 0, "validation", sets=named, source="aggregate")
+    state = LiveSession.start(study.file, planned_header(plan, study.file, "V1"))
+    for number, block in enumerate(state.header.blocks[1:], 1):
+        trial = Trial(1, number, 1, {}, 0.0)
+        assert sum(seconds for _, seconds in state.steps_of(trial)) == (6 if block.material == "hard" else 13)
+    with pytest.raises(InputError, match=r"materials\.foam\.session\.texts is not a key"):
+        Study.from_dict(RAW | {"materials": {"foam": {"session": {"texts": {"hello": "?"}}}}})
+    with pytest.raises(InputError, match=r'materials\.foam\.session\.validation\.steps .* must show "a" and "b"'):
+        Study.from_dict(
+            RAW | {"materials": {"foam": {"session": {"validation": {"steps": [{"show": "a", "seconds": 1}]}}}}}
+        )
+
+
+def test_people_are_validated_with_the_materials_of_which_they_have_a_map():
+    def own(*people):
+        return {f"{person} {role}": SETS[role] for person in people for role in ("best", "mid", "worst")}
+
+    sets = {"foam": own("P01", "P03"), "soft": own("P02", "P03"), "hard": {}}
+    plan = make_plan(GROUPED.file, ["P01", "P02", "P03"], 0, "validation", sets=sets, source="individual")
+    assert [sorted(row) for row in materials_of(plan)] == [["foam"], ["soft"], ["foam", "soft"]]
+    with pytest.raises(InputError, match="P04 has no map of their own"):
+        make_plan(GROUPED.file, ["P04"], 0, "validation", sets=sets, source="individual")
+
+
 def choosing(label, *materials, **changes):
     """Material -> the seed of what a session of the seed 7 chooses with it."""
     head = header_for(STUDY.file, "P01", label, 7, warm=False)
@@ -238,7 +325,8 @@ def test_a_planned_validation_session_runs_blind():
 
 def result():
     people = [{"participant": f"P0{i}", "optimum": {"parameters": SETS["mid"]}} for i in (1, 2)]
-    return {"study": STUDY.file.hash, "seed": 0, "optimum": {"parameters": SETS["best"]}, "participants": people}
+    hashes = {"study": STUDY.file.hash, "meaning": STUDY.file.meaning, "goal": "close"}
+    return {**hashes, "seed": 0, "optimum": {"parameters": SETS["best"]}, "participants": people}
 
 
 def test_results_are_checked(tmp_path):
@@ -248,16 +336,18 @@ def test_results_are_checked(tmp_path):
     assert aggregate_result == msgspec.convert(result(), Result)
     assert set(aggregate_best_sets(STUDY, aggregate_result)) == {"aggregate", "individual:P01", "individual:P02"}
     with pytest.raises(InputError, match="result of another study"):
-        read_result(path, MATERIALS)
+        read_result(path, OTHER)
+    with pytest.raises(InputError, match=r'is the optimum of "close", and the study\'s goal is "similar"'):
+        read_result(path, Study.from_dict(RAW | {"study": RAW["study"] | {"goal": "similar"}}))
     path.write_text("{}")
     with pytest.raises(InputError, match=r"is no result\.json"):
         read_result(path, STUDY)
-    check_participants(aggregate_result, ["V01"], "aggregate")
-    check_participants(aggregate_result, ["P01"], "individual")
+    check_participants([aggregate_result], ["V01"], "aggregate")
+    check_participants([aggregate_result], ["P01"], "individual")
     with pytest.raises(InputError, match="invite people who are not"):
-        check_participants(aggregate_result, ["V01", "P02"], "aggregate")
+        check_participants([aggregate_result], ["V01", "P02"], "aggregate")
     with pytest.raises(InputError, match="no map of their own"):
-        check_participants(aggregate_result, ["V01"], "individual")
+        check_participants([aggregate_result], ["V01"], "individual")
 
 
 def test_a_study_changes_protocols_and_texts():
@@ -316,7 +406,9 @@ def test_ids_that_differ_in_capitals_only_are_refused():
 
 
 def test_a_result_by_another_rule_is_told_apart_from_other_trials():
-    result = Result(STUDY.file.hash, FoundOptimum({}), (FoundPerson("P01"),), rule="average")
+    result = Result(
+        STUDY.file.hash, STUDY.file.meaning, "close", FoundOptimum({}), (FoundPerson("P01"),), rule="average"
+    )
     answers = pd.DataFrame({"participant": "P01", "trial": [1], "response": "close", "u": 0.5, "v": 0.5})
     cohort = cohort_of(answers, STUDY)
     with pytest.raises(InputError, match=r'is by the rule "average", and the study\'s is "bcm"'):

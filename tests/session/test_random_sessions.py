@@ -20,6 +20,7 @@ from hilbo import Study
 from hilbo.app.pages.session_views import experimenter_view, participant_view
 from hilbo.session.log import actions as live
 from hilbo.session.log.header import header_for
+from hilbo.session.log.header_check import protocol_of
 from hilbo.session.log.records import RefusedError
 from hilbo.session.log.state import LiveSession
 from hilbo.session.plan.plan import make_plan, planned_header
@@ -131,7 +132,7 @@ class Lab:
         trial = self.state.pending
         if trial is None:
             return
-        asks = live.protocol(STUDY.file.session, self.header.blocks[trial.block].phase).asks
+        asks = protocol_of(STUDY.file, self.header.blocks[trial.block]).asks
         values = {ask: "a" if ask == "preferred" else STUDY.responses[self.rng.integers(3)] for ask in asks}
         client = f"c{len(self.events)}"
         self.log(live.answer(self.state, trial.id, client, values, self.clock, felt=whole))

@@ -15,15 +15,16 @@ from hilbo import Study
 from hilbo.cli import main
 from hilbo.cli.terminal.console import start
 from hilbo.errors import InputError
+from hilbo.likelihoods import Goal
 from hilbo.report.figures.power import power_figure
 from hilbo.report.power import enough, write_power
 from hilbo.simulation.power import (
     Plan,
     _with_trials,
+    goal_probability,
     power_table,
     simulate_power,
     summarise,
-    top_probability,
 )
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import people
@@ -45,7 +46,7 @@ def test_the_probability_of_the_highest_answer_is_that_of_many_answers():
         return jnp.mean(given == 2)
 
     shares = [float(share(jnp.asarray(point))) for point in x]
-    np.testing.assert_allclose(top_probability(persons, 3, x), shares, atol=0.01)
+    np.testing.assert_allclose(goal_probability(persons, Goal.highest(3), x), shares, atol=0.01)
 
 
 def test_summaries_of_errors_that_are_known():
@@ -65,9 +66,10 @@ def test_summaries_of_errors_that_are_known():
 def test_the_page_says_how_sure_a_share_is(tmp_path):
     rows = [(s, 2, t, 0.1 * s, 0.01 * t) for s in range(5) for t in (10, 20)]
     errors = pd.DataFrame(rows, columns=["study", "participants", "trials", "optimum", "map"])
-    cost = {"preset": "paper", "seconds": 1.0, "jobs": 1}
+    cost = {"preset": "paper", "material": "gel", "seconds": 1.0, "jobs": 1}
     content = write_power(study(), errors, Plan((2,), (10, 20), 5, 0), 0.25, cost, tmp_path)
-    assert "60 % (23 to 88)" in " ".join((tmp_path / "report.html").read_text().split())
+    page = " ".join((tmp_path / "report.html").read_text().split())
+    assert "60 % (23 to 88)" in page and "population “paper”, material gel, were run" in page
     assert content["summary"][0]["reached_low"] == pytest.approx(0.2307, abs=1e-4)
     assert "2 participants: not shown by these 5 studies, up to 20 trials" in " ".join(
         (tmp_path / "report.html").read_text().split()

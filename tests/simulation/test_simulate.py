@@ -7,9 +7,11 @@ import pytest
 
 from hilbo.errors import InputError
 from hilbo.simulation import simulate
+from hilbo.simulation.folder import simulate_folder
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import Person
 from hilbo.study.config import Study
+from hilbo.study.folder import read_folder
 
 STUDY = Study.load("hilbo/data/paper.toml")
 
@@ -61,3 +63,31 @@ def test_a_population_of_another_study_is_refused():
     five = Study.load("hilbo/data/video_quality.toml")
     with pytest.raises(InputError, match="2 criteria"):
         simulate.people(five, PRESETS["paper"], 2, 0)
+
+
+def test_each_material_is_simulated(tmp_path):
+    study = tmp_path / "s.toml"
+    study.write_text("""
+schema = 1
+[study]
+name = "two"
+responses = ["no", "yes"]
+[parameters]
+u = {low = 0.0, high = 1.0}
+[selection]
+trials = 3
+space_filling = 3
+[aggregation]
+rule = "learnt-2"
+[materials.gel]
+[materials.foam.parameters.u]
+high = 5.0
+""")
+    (tmp_path / "out").mkdir()
+    gel, foam = simulate_folder(tmp_path / "out", None, 2, 0, study)
+    folder = read_folder(tmp_path / "out")
+    assert [material.name for material in folder.materials] == [gel.material, foam.material] == ["gel", "foam"]
+    for simulated, material in zip((gel, foam), folder.materials, strict=True):
+        assert material.cohort.names == ("P01", "P02") and material.study.space == simulated.study.space
+        np.testing.assert_allclose(material.cohort.trials.x, simulated.cohort.trials.x, atol=1e-9)
+    assert gel.population.truth != foam.population.truth

@@ -54,6 +54,6 @@ def test_draws_are_largest_where_people_liked_it():
     felt = 2.0 - 12.0 * ((x - [0.3, 0.6]) ** 2).sum(axis=1) + 0.5 * rng.normal(size=60)
     gp = OrdinalGP(RBF(6.0, 4.0), OrdinalProbit((0.5, 1.5), 0.5))
     trials = Trials.from_arrays(x, (felt > 0.5).astype(int) + (felt > 1.5), 64)
-    places = best_places(STUDY.space, [fit(gp, trials)], count=200)
+    places = best_places(STUDY.space, STUDY.goal, [fit(gp, trials)], count=200)
     assert places.points.shape == (250, 2) and float(places.share.sum()) == pytest.approx(1.0)
     assert centre_of(places.points, places.share) == pytest.approx([0.3, 0.6], abs=0.08)

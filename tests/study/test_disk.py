@@ -11,8 +11,8 @@ from broken_disk import Process, changes, patched_disk
 from hilbo.cli.terminal.console import results
 from hilbo.cli.terminal.new_file import write_new
 from hilbo.errors import InputError
-from hilbo.study.disk.lock import JOURNAL, LOCK, locked_folder
-from hilbo.study.disk.new_file import new_file, rewrite_file, write_file
+from hilbo.study.disk.lock import JOURNAL, LOCK, held, locked_folder
+from hilbo.study.disk.new_file import new_file, remove_unfinished, rewrite_file, write_file
 
 
 @pytest.fixture(autouse=True)
@@ -75,6 +75,21 @@ def test_of_twenty_who_write_a_file_at_once_one_does(tmp_path, monkeypatch, link
     assert len(outcomes) == 1 and all("exists already" in sentence for sentence in refusals)
     assert (tmp_path / "study.toml").read_text() == f"{outcomes[0]}"
     assert names(tmp_path) == ["study.toml"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows deletes no open file")
+def test_leftovers_are_deleted_under_their_lock(tmp_path, monkeypatch):
+    """A writer that has created its file and not yet locked it must not lose it after it has."""
+    (tmp_path / ".hilbo-0.part").write_text("")
+    unlink, locked = Path.unlink, []
+
+    def watched(path, **options):
+        locked.append(held(path, 0) is None)
+        unlink(path, **options)
+
+    monkeypatch.setattr(Path, "unlink", watched)
+    remove_unfinished(tmp_path)
+    assert locked == [True] and not names(tmp_path)
 
 
 def test_planted_links_are_not_followed(tmp_path):

@@ -114,7 +114,7 @@ def test_materials_have_their_own_references(tmp_path):
     assert [m.name for m in study_folder.materials] == ["soft", "hard"] and len(study_folder.limits) == 1
     soft, hard = study_folder.materials
     assert soft.study.space.mechanics.K_eff == 0.3 and hard.study.space.mechanics.K_eff == 0.44
-    np.testing.assert_allclose([m.reference[0] for m in (soft, hard)], [4 / 31, 7 / 31])
+    np.testing.assert_allclose([m.reference.x[0] for m in (soft, hard)], [4 / 31, 7 / 31])
     strict = read_folder(folder, "trials < 5").materials[0]
     with pytest.raises(InputError, match="leaves out all 1"):
         analyse(strict.study, strict.cohort)

@@ -81,7 +81,7 @@ def test_learnt_2_seeks_its_optimum_where_the_best_is_most_often_near(learnt_2):
     study, cohort, map_ = learnt_2
     x = search_points(study.space, 0)
     optimum = map_optimum(study, map_, x)
-    places = best_places(study.space, [map_.shared])
+    places = best_places(study.space, study.goal, [map_.shared])
     theta, away = np.asarray(map_.shared.gp.kernel.theta), np.asarray(x)[:, None] - np.asarray(places.points)
     near = np.exp(-4 * np.sum(theta * away**2, axis=2)) @ np.asarray(places.share)
     chance = np.asarray(eqx.filter_jit(map_.class_probabilities)(study.gp.likelihood, x))[:, -1]

@@ -5,6 +5,7 @@ All read from as many points, so that they share what is compiled.
 
 import dataclasses
 import functools
+import json
 from importlib.resources import files
 
 import equinox as eqx
@@ -19,7 +20,8 @@ from studies import PLAIN, plain
 from hilbo import Study, passivity
 from hilbo.errors import InputError
 from hilbo.search.candidates import search_points
-from hilbo.study.analysis.tolerance import best_mid_worst, dominant, slice_through, tolerance
+from hilbo.study.analysis.best_mid_worst import best_mid_worst, second_choice_sentence
+from hilbo.study.analysis.tolerance import dominant, slice_through, tolerance
 
 POINTS = 1026  # of a slice through an optimum that is between the points of its grid
 
@@ -73,11 +75,38 @@ def test_a_corner_that_nobody_knows_is_not_the_worst():
     np.testing.assert_allclose(three_sets(hill, prior=4.0).x[2], [1.0, 1.0], atol=1e-9)
 
 
-def test_maps_that_know_too_little_are_refused():
-    with pytest.raises(InputError, match="more answers are needed"):
-        three_sets(Hill([0.2, 0.3], [0.7, 0.7], 0.95, 0.95))
-    with pytest.raises(InputError, match="smaller `apart`"):
-        three_sets(Hill([0.2, 0.3], [0.7, 0.7]), apart=1.5)
+def test_maps_that_know_too_little_have_sets_of_second_choice():
+    """Worst is the lowest of the best-known candidates that are apart from the best; mid is as far from both as can
+    be."""
+    defined = three_sets(Hill([0.2, 0.3], [0.7, 0.7]))
+    assert defined.second_choice == ()
+    nothing_known = three_sets(Hill([0.2, 0.3], [0.7, 0.7], 0.95, 0.95))
+    assert nothing_known.second_choice == ("mid", "worst")
+    crowded = three_sets(Hill([0.2, 0.3], [0.7, 0.7]), apart=1.5)
+    assert crowded.second_choice == ("mid",)
+    for sets in (nothing_known, crowded):
+        assert sets.mean[0] > sets.mean[1] > sets.mean[2]
+    names = [second_choice_sentence(plain(), name, "P07") for name in ("mid", "worst")]
+    assert all("P07" in sentence for sentence in names)
+
+
+def test_two_levels_or_a_map_that_is_not_finite_have_no_three_sets():
+    with pytest.raises(InputError, match="no three different stimuli"):
+        three_sets(Hill([np.nan, 0.3], [0.7, 0.7]))
+    raw = {"schema": 1} | json.loads(plain().file.content)
+    raw["parameters"] = {"u": {"levels": ["silk", "wood"]}}
+    study = Study.from_dict(raw)
+    with pytest.raises(InputError, match="no three different stimuli"):
+        best_mid_worst(study, lambda x: (x[:, 0], jnp.full(len(x), 0.04)), search_points(study.space, 0))
+
+
+def test_without_a_known_minimum_worst_is_the_lowest_known_place():
+    """A hill that falls away on all sides, known only near its top: its minima are the unknown corners."""
+    hill = Hill([0.5, 0.5], [5.0, 5.0], far_sd=0.95)
+    sets = three_sets(hill)
+    assert sets.second_choice == ("worst",)
+    away = np.linalg.norm(sets.x[2] - 0.5)
+    assert 0.2 <= away < 0.25 and sets.sd[2] <= 0.8
 
 
 def test_tolerance_ends_where_close_stops_being_likeliest():

@@ -72,6 +72,18 @@ def test_a_delay_of_0_is_no_part_of_a_studys_hash(path):
     assert file.space.mechanics.delay == file.material("gel").space.mechanics.delay == 0.000271
 
 
+def test_which_sets_are_validated_is_no_part_of_a_studys_hash(path):
+    """The table may change after the sessions: plans hold the sets themselves."""
+    plain = StudyFile.load(path).hash
+    text = path.read_text()
+    path.write_text(text + "\n[validation]\nknown = 0.9\napart = 0.1\n")
+    file = StudyFile.load(path)
+    assert file.hash == plain and (file.validation.known, file.validation.apart) == (0.9, 0.1)
+    path.write_text(text + "\n[validation]\nknown = 1.5\n")
+    with pytest.raises(InputError, match=r"validation.known is 1.5; it must be a number above 0, at most 1"):
+        StudyFile.load(path)
+
+
 def test_what_has_to_be_computed_is_the_studys_to_refuse(path):
     path.write_text(path.read_text().replace("damping = 0.95", "damping = 0.001"))
     assert StudyFile.load(path).space.mechanics.damping == 0.001

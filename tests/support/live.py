@@ -29,7 +29,8 @@ def header(kind="optimisation", count=6, warm=2):
     else:
         pairs = [Planned(*pair, first) for pair in itertools.combinations("DEF", 2) for first in ("a", "b")]
         block = Block("validation", len(pairs), tuple(pairs), rest=0.0)
-    return Header(study=STUDY.file.hash, participant="P01", session="1", seed=0, blocks=(warm_up, block), sets=SETS)
+    study = {"study": STUDY.file.hash, "study_tables": STUDY.file.tables}
+    return Header(**study, participant="P01", session="1", seed=0, blocks=(warm_up, block), sets=SETS)
 
 
 class FakeChooser:

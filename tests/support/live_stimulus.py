@@ -5,6 +5,8 @@ import functools
 import importlib.util
 import sys
 import threading
+import urllib.error
+from http import HTTPStatus
 from pathlib import Path
 
 from live_server import Live
@@ -133,7 +135,13 @@ def all_answered(live):
         if view["may"]["begin"]:
             live.participant.post("/api/participant/begin", {})
         elif view["questions"]:
-            live.answer(view)
+            try:
+                live.answer(view)
+            except urllib.error.HTTPError as error:
+                if (
+                    error.code != HTTPStatus.CONFLICT
+                ):  # else the trial was voided since the look, and the page looks again
+                    raise
         return view
 
     live.until(lambda view: view["phase"] == "done", acted)

@@ -67,6 +67,7 @@ def opened(
     except InputError:
         let_go(log, wanted.resume)
         raise
+    study = log.state.study  # a session goes on with the study file that it was begun with
     tag = _tag(log.state.header)
     if study.stimulus is not None:
         rig = functools.partial(StimulusRig, study, tag)
@@ -130,7 +131,7 @@ def _resumed(wanted: Wanted, study: StudyFile) -> tuple[EventLog, LiveChooser]:
                 f"{log.path}: was begun with a participant; leave --dry-run out, or choose another --session."
             )
         _check_asked_for(wanted, header, log)
-        return log, LiveChooser(log.state, _warm_starts(wanted, study, log.state.header))
+        return log, LiveChooser(log.state, _warm_starts(wanted, log.state.study, log.state.header))
     except BaseException:
         log.close()
         raise

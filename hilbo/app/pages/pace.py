@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from hilbo.session.log.header_check import protocol_of
 from hilbo.session.log.state import LiveSession
-from hilbo.study.file.protocols import protocol
 
 __all__ = ["duration", "minutes_left"]
 
@@ -27,6 +27,6 @@ def minutes_left(state: LiveSession) -> float:
     total = 0.0
     for i, block in enumerate(state.header.blocks):
         left = 0 if state.full(i) else state.quota(i) - len(state.counted(i)) - len(state.skipped(i))
-        pace = 1.5 * protocol(state.study.session, block.phase).seconds if len(gaps) < 2 else float(np.median(gaps))
+        pace = 1.5 * protocol_of(state.study, block).seconds if len(gaps) < 2 else float(np.median(gaps))
         total += left * pace + (block.rest if left and state.gate(i) == "rest" else 0.0)
     return total / 60.0

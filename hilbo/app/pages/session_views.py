@@ -8,10 +8,10 @@ from typing import Any
 
 import msgspec
 
+from hilbo.session.log.header_check import protocol_of
 from hilbo.session.log.records import Trial
 from hilbo.session.log.state import LiveSession
 from hilbo.study.file.languages import language
-from hilbo.study.file.protocols import protocol
 
 __all__ = ["View", "experimenter_view", "participant_view"]
 
@@ -53,7 +53,7 @@ def _shown_trial(state: LiveSession, trial: Trial) -> View:
     """A trial for the participant: its steps, the index of the running one, whether all renderings were presented
     (`felt`), and its questions; no parameters."""
     session = state.study.session
-    asks = protocol(session, state.header.blocks[trial.block].phase).asks
+    asks = protocol_of(state.study, state.header.blocks[trial.block]).asks
     alone = "b" not in trial.renderings
     return {
         "id": trial.id,
@@ -108,11 +108,12 @@ def _progress(state: LiveSession) -> View:
 
 
 def experimenter_view(state: LiveSession) -> View:
-    """The whole state as a dict for JSON, parameters included, for the experimenter's page and for programs."""
+    """The whole state as a dict for JSON, parameters included, for the experimenter's page and for programs; without
+    the study file, which the log holds."""
     header = state.header
     return {
         "study": {"name": state.study.name, "hash": state.study.hash, "responses": list(state.study.responses)},
-        "header": msgspec.to_builtins(header),
+        "header": {name: value for name, value in msgspec.to_builtins(header).items() if name != "study_tables"},
         "screen": state.screen,
         "seq": state.seq,
         "block": state.block,

@@ -136,11 +136,12 @@ def _slice(study, maps: _Slices, k: int, pair: _Pair, marks, levels, felt) -> di
         [round(float(v), 4) if ok else None for v, ok in zip(row, oks, strict=True)]
         for row, oks in zip(maps.mean[k], maps.feasible[k], strict=True)
     ]
+    goal = study.goal.category / (len(study.responses) - 1)
     return {
         "across": names[across],
         "up": _ANSWER if up is None else names[up],
         "held": ", ".join(held),
-        "best": [float(best[across]), 1.0 if up is None else float(best[up])],
+        "best": [float(best[across]), goal if up is None else float(best[up])],
         "mean": shown,
         "trials": trials,
     }

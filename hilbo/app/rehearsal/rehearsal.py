@@ -71,9 +71,8 @@ class Decider:
         return self._study.responses[int(self._answer(key, jnp.asarray(unit[ask[-1]])))]
 
     def _distance(self, x: np.ndarray) -> float:
-        """Distance of a point `x` (d,) of the unit cube from the participant's optimum, in tolerances."""
-        away = simulate.felt_apart(self._person.levels, x, np.asarray(self._person.optimum))
-        return float(np.linalg.norm(away / np.asarray(self._person.tolerance)))
+        """Distance of a point `x` (d,) of the unit cube from what the participant prefers, in tolerances."""
+        return abs(float(self._person.perceived(jnp.asarray(x))))
 
 
 def fast_study(source: Path, target: Path, seconds: float | None, warm_up: int | None = None) -> Path:

@@ -6,9 +6,11 @@ What is presented it learns from the experimenter's JSON, which no participant h
 """
 
 import contextlib
+import io
 import json
 import shutil
 import tempfile
+import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -87,9 +89,15 @@ class Client:
 
     @staticmethod
     def _ask(request: urllib.request.Request) -> Any:
-        """Send a request and return its JSON response; waits up to 60 s."""
-        with urllib.request.urlopen(request, timeout=60) as reply:
-            return json.load(reply)
+        """Send a request and return its JSON response; waits up to 60 s. An `HTTPError` has its content in memory, so
+        that no connection stays open until it is collected."""
+        try:
+            with urllib.request.urlopen(request, timeout=60) as reply:
+                return json.load(reply)
+        except urllib.error.HTTPError as error:
+            with error:
+                content = io.BytesIO(error.read())
+            raise urllib.error.HTTPError(error.url, error.code, error.msg, error.headers, content) from None
 
 
 class Participant:

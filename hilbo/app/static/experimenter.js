@@ -128,9 +128,9 @@ function showMap() {
   const { slices, ranges } = map, [low, high] = rangeOf(slices);      // equal as long as the answers say nothing of where
   const marks = slices.flatMap((s) => s.trials);
   put("scale-low", number(low, 2)); put("scale-high", number(high, 2));
-  put("map-title", high > low ? "Posterior mean, slices through its maximum" : "Posterior mean: the same everywhere so far");
+  put("map-title", high > low ? "Posterior mean, slices through the optimum" : "Posterior mean: the same everywhere so far");
   put("legend", [
-    high > low ? "Cross: the maximum." : "", "Circles: rated stimuli, darker for higher answers, fainter away from the slice.",
+    high > low ? "Cross: the optimum." : "", "Circles: rated stimuli, darker for higher answers, fainter away from the slice.",
     marks.some((t) => t.now) ? "Red ring: what is presented now." : "",
     infeasible(slices) ? "Hatched: infeasible." : "",
   ].filter(Boolean).join(" "));

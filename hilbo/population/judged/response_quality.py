@@ -68,6 +68,7 @@ _LEVEL = 4.0  # prior variances
 _MOST = 200  # answers of a person that are filtered, at the price of their cube
 _RATES = np.linspace(0.0, 1.0, 18) ** 3  # an answer that is all but excluded takes small ones
 _DRIFTS = np.array([6.0 * part * abs(part) for part in np.linspace(-1.0, 1.0, 21)])  # prior standard deviations
+_INSIDE, _REFINEMENTS = 4, 3  # fewest points of the grid in an interval; times that it is refined, by 10 each
 _RULE = re.compile(r"^\s*(\w+)\s*(<=|>=|<|>)\s*([-+0-9.eE]+)\s*$")
 
 
@@ -95,7 +96,8 @@ def measure_people(gp: OrdinalGP, trials: Trials, names: tuple[str, ...], *, nea
     """
     model = OrdinalGP(_Levelled(gp.kernel), gp.likelihood)
     scale = jnp.sqrt(jnp.asarray(gp.kernel.variance))
-    log_likelihoods = np.asarray(_log_likelihoods(model, _evenly(trials), scale * jnp.asarray(_DRIFTS, scale.dtype)))
+    used = _evenly(trials)
+    log_likelihoods = np.asarray(_log_likelihoods(model, used, scale * jnp.asarray(_DRIFTS, scale.dtype)))
     attentive = log_likelihoods[:, 0, np.flatnonzero(_DRIFTS == 0.0)[0]]
     rows = []
     for j, name in enumerate(names):
@@ -103,8 +105,10 @@ def measure_people(gp: OrdinalGP, trials: Trials, names: tuple[str, ...], *, nea
         x, q = np.asarray(trials.x[j])[mask], np.asarray(trials.q[j])[mask]
         row = {"participant": name, "trials": len(q), "categories": len(np.unique(q))}
         row |= _consistency(x, q, near)
-        row |= _estimate_columns("lapse", _lapse(log_likelihoods[j], len(q)))
-        row |= _estimate_columns("drift", _drift(log_likelihoods[j], len(q)))
+        own = jax.tree.map(lambda leaf, j=j: leaf[j : j + 1], used)
+        drifts, log_likelihood = _refined(model, own, scale, log_likelihoods[j])
+        row |= _estimate_columns("lapse", _lapse(log_likelihood, len(q)))
+        row |= _estimate_columns("drift", _drift(drifts, log_likelihood, len(q)))
         rows.append(row | {"surprise": float(-attentive[j] / min(len(q), _MOST)) if len(q) else np.nan})
     return pd.DataFrame(rows, columns=["participant", *MEASURES])
 
@@ -146,6 +150,32 @@ def _log_likelihoods(gp: OrdinalGP, trials: Trials, drifts: Float[Array, " shift
     return jax.lax.map(person, trials)
 
 
+def _refined(
+    gp: OrdinalGP, own: Trials, scale: Float[Array, ""], log_likelihood: Float[np.ndarray, "rates shifts"]
+) -> tuple[Float[np.ndarray, " more"], Float[np.ndarray, "rates more"]]:
+    """Drifts in prior standard deviations, those of `_DRIFTS` and more about the most likely one, and the log
+    likelihood there: with small noise and many responses the 95 % interval may be narrower than the grid.
+
+    `own`: the participant's trials, stacked (1, n); `scale`: the prior standard deviation.
+    """
+    drifts = _DRIFTS
+    for _ in range(_REFINEMENTS if np.any(own.mask) else 0):
+        profile = log_likelihood.max(axis=0)
+        _, low, high = _profile(drifts, profile)
+        if np.sum((drifts >= low) & (drifts <= high)) >= _INSIDE:
+            break
+        highest = int(np.argmax(profile))
+        begin, end = max(highest - 1, 0), min(highest + 1, len(drifts) - 1)
+        finer = np.linspace(drifts[begin], drifts[end], 21)
+        near = np.min(np.abs(finer[:, None] - drifts), axis=1)
+        finer = finer[near > 1e-3 * (drifts[end] - drifts[begin])]  # equal points but for rounding spoil interpolation
+        more = np.asarray(_log_likelihoods(gp, own, scale * jnp.asarray(finer, scale.dtype)))[0]
+        order = np.argsort(np.concatenate([drifts, finer]))
+        drifts = np.concatenate([drifts, finer])[order]
+        log_likelihood = np.concatenate([log_likelihood, more], axis=1)[:, order]
+    return drifts, log_likelihood
+
+
 def repeats(x: Float[np.ndarray, "n d"], near: float = _NEAR) -> np.ndarray:
     """Disjoint pairs (k, 2) of rows of `x` (n, d) within `near` of each other (NRMSE), nearest first, each row once."""
     distance = np.sqrt(np.mean((x[:, None, :] - x[None, :, :]) ** 2, axis=2))
@@ -170,15 +200,18 @@ def _lapse(log_likelihood: Float[np.ndarray, "rates shifts"], answers: int) -> t
     return np.nan if (low, high) == (0.0, 1.0) else best, low, high
 
 
-def _drift(log_likelihood: Float[np.ndarray, "rates shifts"], answers: int) -> tuple[float, float, float]:
+def _drift(
+    drifts: Float[np.ndarray, " shifts"], log_likelihood: Float[np.ndarray, "rates shifts"], answers: int
+) -> tuple[float, float, float]:
     """Drift in prior standard deviations and the ends of its 95 % interval, infinite where the grid ends.
 
-    The drift is NaN if both ends are infinite, as they are for fewer than two `answers` (their number).
+    `drifts`: the grid. The drift is NaN if both ends are infinite, as they are for fewer than two `answers` (their
+    number).
     """
     if answers < 2:
         return np.nan, -np.inf, np.inf
-    best, low, high = _profile(_DRIFTS, log_likelihood.max(axis=0))
-    below, above = low <= _DRIFTS[0], high >= _DRIFTS[-1]
+    best, low, high = _profile(drifts, log_likelihood.max(axis=0))
+    below, above = low <= drifts[0], high >= drifts[-1]
     return np.nan if below and above else best, -np.inf if below else low, np.inf if above else high
 
 

@@ -7,7 +7,7 @@ specified noise, or variance, all others are in its unit. Their uncertainty is f
 posterior; one that is hardly narrower than its prior is not identified.
 """
 
-from collections.abc import Callable, Set
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -21,18 +21,19 @@ from jaxtyping import Array, Bool, Float, Int
 from hilbo.errors import InputError
 from hilbo.numerics.shown import shown
 from hilbo.ordinal_gp import Posterior, Trials
-from hilbo.population.learnt.factors import FINE, Chosen, diagonals, with_factors_if_worth
+from hilbo.population.learnt.factors import Chosen, with_factors_if_worth
 from hilbo.population.learnt.posterior import (
     KERNELS,
+    LEFT,
     NOTHING,
     Coordinates,
-    Problem,
     Stated,
     cost_at,
     medians,
     model_at,
 )
-from hilbo.population.learnt.search import LARGEST, Search, first_search, searched
+from hilbo.population.learnt.search import LARGEST, first_search, searched
+from hilbo.population.learnt.spread import posterior_spread
 from hilbo.population.rules.recipes import LEARNT_1, WIDTHS, Recipe
 from hilbo.population.shared.features import pivots_for, unexplained
 from hilbo.population.shared.people_model import PeopleModel
@@ -49,15 +50,15 @@ __all__ = [
     "not_learnt",
 ]
 
-_ROUGH = 0.05
+_ROUGH = 0.05, 0.5  # what features may leave at an answered point: of the shared variance, and over the noise variance
+_OFF = 0.25  # posterior standard deviations, by which too few features may shift a hyperparameter
 _AT_A_TIME = 2  # draws: much of their arithmetic is of one core
 _MOST_FEATURES, _NUMBERS = 1024, 64_000_000  # of the shared function; of all people's features, half a gigabyte
-_WHOLE = 32  # most participants with a full Hessian of the individual coordinates: one or two gradients each
 
 
 class Learnt(eqx.Module):
     """Hyperparameters learnt from all responses, with a normal approximation of their posterior: `sd` by coordinate,
-    and `covariance` (k, k) without individual ones. `converged`: the search ended at a maximum with accurate features.
+    and `covariance` (k, k) without individual ones. `converged`: the search ended at a maximum, with enough features.
     """
 
     recipe: str = eqx.field(static=True)
@@ -103,8 +104,7 @@ def learnt_function(learnt: Learnt, trials: Trials) -> SharedFunction:
     converged.
     """
     answers = _as_learnt(learnt, trials)
-    most = max(LARGEST, min(_MOST_FEATURES, _NUMBERS // answers.blank.size))
-    pivots = pivots_for(learnt.model.unit, answers, most=most)
+    pivots = pivots_for(learnt.model.unit, answers, most=_most_features(answers))
     return shared_function(learnt.model, answers, learnt.weights, pivots)
 
 
@@ -186,7 +186,7 @@ def learn(
     if near is not None and not bool(begun.cost.usable):
         return learn(trials, categories, stated, recipe)
     chosen = with_factors_if_worth(*searched(begun, problem, common), recipe)
-    return _recorded(chosen, *_posterior_spread(chosen.search, chosen.problem, chosen.free), recipe)
+    return _recorded(*_with_enough_features(chosen, *posterior_spread(chosen)), recipe)
 
 
 def not_learnt(trials: Trials, categories: int, stated: Stated = NOTHING, recipe: Recipe = LEARNT_1) -> Learnt:
@@ -201,15 +201,62 @@ def not_learnt(trials: Trials, categories: int, stated: Stated = NOTHING, recipe
         medians(answers, stated, recipe.priors, KERNELS[recipe.kernel]), answers, stated, recipe
     )
     nothing = jnp.zeros((0, 0), trials.x.dtype)
-    return _recorded(Chosen(search, problem, frozenset(), {}), {}, nothing, recipe)
+    return _recorded(Chosen(search, problem, frozenset(), {}), {}, nothing, True, recipe)
 
 
-def _recorded(chosen: Chosen, sd: Coordinates, covariance: Float[Array, "k k"], recipe: Recipe) -> Learnt:
-    """Result of a search, with the standard deviations and the covariance of its coordinates."""
+def _with_enough_features(
+    chosen: Chosen, sd: Coordinates, covariance: Float[Array, "k k"]
+) -> tuple[Chosen, Coordinates, Float[Array, "k k"], bool]:
+    """The end of a search and its posterior spread, continued with more features if too few of them shift a
+    hyperparameter by more than `_OFF`; and whether the features are enough in the end.
+
+    The shift is one Newton step by the gradient with more features, computed only where the features leave more of the
+    shared function's variance than `_ROUGH`. Whether participants differ in the use of the scale is not decided again.
+    """
+    search, problem, free, _ = chosen
+    most, rough = _most_features(problem.answers), _is_rough(chosen)
+    if not rough or most <= len(problem.pivots.points):
+        return chosen, sd, covariance, not rough
+    model = _model_of(chosen)
+    pivots = pivots_for(model.unit, problem.answers, LEFT, fewest=len(problem.pivots.points), most=most)
+    finer = dataclasses.replace(problem, pivots=pivots, theta=model.theta)
+    cost = cost_at(search.coordinates, search.cost.weights, finer)
+    names = free - set(INDIVIDUAL)
+    shift = covariance @ ravel_pytree({name: cost.gradient[name] - search.cost.gradient[name] for name in names})[0]
+    if np.all(np.abs(shift) <= _OFF * ravel_pytree({name: sd[name] for name in names})[0]):
+        return chosen, sd, covariance, True
+    further, finer = searched(search._replace(cost=cost), finer, free, most)
+    more = chosen._replace(search=further, problem=finer)
+    return more, *posterior_spread(more), not _is_rough(more)
+
+
+def _most_features(answers: Tallies) -> int:
+    """Largest number of features that memory allows for these responses."""
+    return max(LARGEST, min(_MOST_FEATURES, _NUMBERS // answers.blank.size))
+
+
+def _model_of(chosen: Chosen) -> PeopleModel:
+    """The model at the end of a search."""
+    problem = chosen.problem
+    return model_at(chosen.search.coordinates, problem.answers, problem.stated, problem.kernel, problem.fixed_point)
+
+
+def _left(chosen: Chosen) -> Float[Array, ""]:
+    """Largest part of the shared function's prior variance, at an answered point, that the features leave."""
+    return unexplained(_model_of(chosen).unit, chosen.problem.answers, chosen.problem.pivots)
+
+
+def _is_rough(chosen: Chosen) -> bool:
+    """Whether the features leave more than `_ROUGH`."""
+    model, left = _model_of(chosen), float(_left(chosen))
+    return left > _ROUGH[0] or left * float(model.shared / model.noise**2) > _ROUGH[1]
+
+
+def _recorded(chosen: Chosen, sd: Coordinates, covariance: Float[Array, "k k"], enough: bool, recipe: Recipe) -> Learnt:
+    """Result of a search, with the standard deviations and the covariance of its coordinates; `enough`: whether its
+    features are enough."""
     search, problem, free, gains = chosen
-    answers = problem.answers
-    model = model_at(search.coordinates, answers, problem.stated, problem.kernel, problem.fixed_point)
-    left = unexplained(model.unit, answers, problem.pivots)
+    model, left = _model_of(chosen), _left(chosen)
     return Learnt(
         recipe=recipe.name,
         model=model,
@@ -222,73 +269,6 @@ def _recorded(chosen: Chosen, sd: Coordinates, covariance: Float[Array, "k k"], 
         steps=jnp.asarray(search.steps),
         rank=jnp.asarray(len(problem.pivots.points)),
         left=left,
-        converged=search.cost.usable & jnp.asarray(search.ended) & (left <= _ROUGH),
-        people=len(answers.x),
+        converged=search.cost.usable & jnp.asarray(search.ended) & enough,
+        people=len(problem.answers.x),
     )
-
-
-def _posterior_spread(search: Search, problem: Problem, free: Set[str]) -> tuple[Coordinates, Float[Array, "k k"]]:
-    """Posterior standard deviations of the `free` coordinates, by a normal approximation, and their covariance (k, k)
-    without widths and sensitivities.
-
-    The curvature is from differences of gradients at the end of the search. A standard deviation is infinite where the
-    variance comes out not positive: then there is no maximum.
-    """
-    coordinates, end = search.coordinates, search.cost
-    own = [name for name in INDIVIDUAL if name in free]
-    common = {name: value for name, value in coordinates.items() if name in free - set(INDIVIDUAL)}
-    flat, restore = ravel_pytree(common)
-
-    def difference(way: Coordinates) -> Coordinates:
-        moved = coordinates | {name: coordinates[name] + FINE * step for name, step in way.items()}
-        ahead = cost_at(moved, end.weights, problem).gradient
-        return jax.tree.map(lambda a, b: (a - b) / FINE, ahead, end.gradient)
-
-    def of_common(moved: Coordinates) -> np.ndarray:
-        return np.asarray(ravel_pytree({name: moved[name] for name in common})[0])
-
-    columns = [difference(restore(unit)) for unit in jnp.eye(flat.size, dtype=flat.dtype)]
-    hessian = np.stack([of_common(column) for column in columns])
-    if not own:
-        covariance = np.linalg.inv(hessian)
-        return restore(jnp.asarray(_root_of_diagonal(covariance))), jnp.asarray(covariance)
-    mixed = np.stack([np.concatenate([np.asarray(column[name]) for name in own]) for column in columns])
-    curvature = _curvature_of_individuals(search, problem, difference, own)
-    covariance = np.linalg.inv(np.block([[hessian, mixed], [mixed.T, curvature]]))
-    sd, k = _root_of_diagonal(covariance), flat.size
-    individual = zip(own, np.split(sd[k:], len(own)), strict=True)
-    every = restore(jnp.asarray(sd[:k])) | {name: jnp.asarray(value) for name, value in individual}
-    return every, jnp.asarray(covariance[:k, :k])
-
-
-def _curvature_of_individuals(
-    search: Search, problem: Problem, difference: Callable[[Coordinates], Coordinates], own: list[str]
-) -> Float[np.ndarray, "o o"]:
-    """Hessian (o, o) of the cost in the individual coordinates `own`, each of which has a value for each participant,
-    one after the other, from `difference`, its product with a vector.
-
-    Of more than 32 participants each one's curvature in the width is the row sum of the Hessian, which keeps that of
-    all together: widths may rise where the gaps fall. With sensitivities the diagonals of all blocks are kept instead,
-    and the mean of the other elements.
-    """
-    like = search.coordinates[own[0]]
-    if like.size <= _WHOLE:
-        columns = [difference({name: unit}) for name in own for unit in jnp.eye(like.size, dtype=like.dtype)]
-        return np.stack([np.concatenate([np.asarray(column[name]) for name in own]) for column in columns])
-    together = {name: difference({name: jnp.ones_like(like)}) for name in own}
-    if "sensitivities" not in own:
-        return np.diag(np.asarray(together["widths"]["widths"]))
-
-    def block(name: str, other: str) -> Float[np.ndarray, "M M"]:
-        diagonal = (of_each[name][other] + of_each[other][name]) / 2
-        between = float(np.sum(np.asarray(together[name][other]) - diagonal)) / (like.size * (like.size - 1))
-        return np.diag(diagonal - between) + between
-
-    of_each = {name: diagonals(search, problem, name) for name in own}
-    return np.block([[block(name, other) for other in own] for name in own])
-
-
-def _root_of_diagonal(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, " k"]:
-    """Standard deviations (k,) of a covariance; infinite where a variance is not positive."""
-    variances = np.diagonal(covariance)
-    return np.sqrt(np.where(variances > 0, variances, np.inf))

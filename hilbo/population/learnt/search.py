@@ -20,7 +20,7 @@ _STEPS, _ROUNDS = 100, 8  # of one descent; descents
 _NEAR = 1e-3  # nats that a step must gain for another: a small part of what answers leave open, however many they are
 _REMEMBERED = 30  # steps; with widths of people's own, the 10 of SciPy take a quarter more of them
 LARGEST = 256
-"""Features of a search: functions that need more are too rugged to be shared by few answers."""
+"""Features of a search, unless its end needs more (`rule`)."""
 _MOVED = 0.35  # of log theta: features of other lengths leave more, but the RBF's no more than 0.004 of the variance
 _REACH = 1.5  # of log theta, in one descent: where lengths grow far beyond it, features become singular
 # About the standard deviations that 600 answers leave: in these units a search is as wide in all directions.
@@ -48,9 +48,9 @@ def first_search(start: Coordinates, answers: Tallies, stated: Stated, recipe: R
     return Search(start, cost_at(start, answers.blank, problem), 0, True), problem
 
 
-def searched(search: Search, problem: Problem, free: Set[str]) -> tuple[Search, Problem]:
-    """Maximise the log posterior over the coordinates in `free`, from the state of `search`; return the end and its
-    problem.
+def searched(search: Search, problem: Problem, free: Set[str], most: int | None = None) -> tuple[Search, Problem]:
+    """Maximise the log posterior over the coordinates in `free`, from the state of `search`, by at most `most`
+    features (None: `LARGEST`); return the end and its problem.
 
     The features stay fixed during a descent, because the cost would jump with others. If the length scales at its end
     need other features, or the descent stopped early, it is repeated with new ones; after eight descents `ended` is
@@ -60,7 +60,7 @@ def searched(search: Search, problem: Problem, free: Set[str]) -> tuple[Search, 
         search = _descended(search, problem, free)
         model = model_at(search.coordinates, problem.answers, problem.stated, problem.kernel)
         rank = len(problem.pivots.points)
-        pivots = pivots_for(model.unit, problem.answers, LEFT, fewest=rank, most=LARGEST)
+        pivots = pivots_for(model.unit, problem.answers, LEFT, fewest=rank, most=most or LARGEST)
         moved = np.abs(np.log(np.asarray(model.theta)) - np.log(np.asarray(problem.theta)))
         if search.ended and len(pivots.points) == rank and not np.any(moved > _MOVED):
             return search, problem

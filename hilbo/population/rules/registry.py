@@ -23,10 +23,9 @@ class Rule:
     """Of an optimum by it, on pages."""
     description: str
     """Of its model, in a pre-registration."""
-    sought: str = "the maximum of the population map"
-    """What is taken for the optimum, in a pre-registration;"""
-    place: str = "where the aggregated map is highest"
-    """The same on pages, with {top} for the highest answer."""
+    optimum: str = "the maximum of the population map"
+    """Definition of the optimum on pages and in pre-registrations, with {goal} for the label of the goal; see
+    `optimum_for`."""
     formula: str = ""
     """Of variance and mean of the map, as HTML, where it is short enough for a page."""
     pointwise: str
@@ -45,11 +44,17 @@ class Rule:
     recipe: Recipe | None = None
     """Of a rule that learns the hyperparameters; others take them from [gp]."""
     predicts: bool = False
-    """Whether pages print its probability of a new participant's highest response: in simulated populations it is near
-    to what happens, and its 95 % intervals contain that about as often as they should."""
+    """Whether pages print its probability of the goal as a new participant's response: in simulated populations like
+    the paper's it is near to what happens, and its 95 % intervals contain that about as often as they should."""
     centred: bool = False
-    """Whether the optimum is the place that the best rendering is most often near (`study.best_places.nearness`), of
-    those where a new person gives the highest answer at most 0.05 less often than anywhere."""
+    """Whether the optimum is the point most often near the optimum of joint posterior draws (`best_places.nearness`),
+    among points where the probability of the goal for a new participant is within 0.05 of its maximum."""
+
+    def optimum_for(self, goal: str, is_highest: bool) -> str:
+        """Definition of the optimum in a study whose goal has the label `goal` and is the highest response or not."""
+        if is_highest or self.learns:
+            return self.optimum.format(goal=goal)
+        return "the point at which the population map is closest to the goal"
 
     @property
     def learns(self) -> bool:
@@ -75,6 +80,10 @@ class Rule:
 
 
 _LEARNT = "the hierarchical model with hyperparameters learnt from all answers, recipe "
+_CENTRED = (
+    "the point that is most often near the optimum of joint posterior draws, among points at which the probability that"
+    ' a new participant answers "{goal}" is within 0.05 of its maximum'
+)
 _ALL: Final = (
     Rule(
         name="bcm",
@@ -113,8 +122,7 @@ _ALL: Final = (
         name="learnt-1",
         label="people who differ, hyperparameters learnt (learnt-1)",
         description=f"{_LEARNT}learnt-1",
-        sought="the one to which a new person most probably gives the highest answer",
-        place='where a new person most probably answers "{top}"',
+        optimum='the point with the largest probability that a new participant answers "{goal}"',
         pointwise="hierarchical",
         joint=True,
         recipe=LEARNT_1,
@@ -123,9 +131,7 @@ _ALL: Final = (
         name="learnt-2",
         label="people who differ, hyperparameters learnt (learnt-2)",
         description=f"{_LEARNT}learnt-2",
-        sought="the place that the best one is most often near, of those to which a new person gives the highest"
-        " answer at most 0.05 less often than to any",
-        place="the place that the best rendering is most often near",
+        optimum=_CENTRED,
         pointwise="hierarchical",
         joint=True,
         recipe=LEARNT_2,
@@ -135,9 +141,7 @@ _ALL: Final = (
         name="learnt-3",
         label="people who differ, hyperparameters learnt (learnt-3)",
         description=f"{_LEARNT}learnt-3",
-        sought="the place that the best one is most often near, of those to which a new person gives the highest"
-        " answer at most 0.05 less often than to any",
-        place="the place that the best rendering is most often near",
+        optimum=_CENTRED,
         pointwise="hierarchical",
         joint=True,
         recipe=LEARNT_3,

@@ -94,9 +94,9 @@ def _answers(cohort: Cohort) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, 
 
 def _look(study: Study, category: int) -> dict[str, Any]:
     """Keyword arguments of `scatter` for a category: a shape of its own, the darker the higher the category; the
-    highest is a circle.
+    goal is a circle.
     """
-    top = category == len(study.responses) - 1
+    top = category == study.goal.category
     look: dict[str, Any] = {"marker": "o" if top else _SHAPES[category % len(_SHAPES)], "s": 15 if top else 9}
     return look | {"facecolor": _fill(study, category), "edgecolor": "black", "linewidth": 0.5}
 

@@ -73,7 +73,7 @@ def _maximum(study: Study, model: Any) -> np.ndarray:
         return np.asarray(model.optimum.x)
     if not isinstance(model, Posterior):
         raise InputError(f"draw_map: model is a {type(model).__name__}; give a Posterior or an Aggregate.")
-    return np.asarray(best_point(study.space, model, search_points(study.space, 0)).x)
+    return np.asarray(best_point(study.goal, study.space, model, search_points(study.space, 0)).x)
 
 
 def _places(names: tuple[str, ...], pair: Any) -> tuple[int, int]:

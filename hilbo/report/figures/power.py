@@ -40,7 +40,7 @@ def power_figure(summary: pd.DataFrame, error: float) -> Figure:
     left.axhline(100 * error, color=GREY, linewidth=0.8)
     left.set(ylabel="error of the optimum, NRMSE (%)", ylim=(0, None))
     middle.set(ylabel=f"studies within {100 * error:g} % (%)", ylim=(0, 100))
-    right.set(ylabel="error of the map, P(highest answer)", ylim=(0, None))
+    right.set(ylabel="error of the map, P(goal)", ylim=(0, None))
     for axes in (left, middle, right):
         axes.set_xlabel("trials of each participant")
         few_ticks(axes.xaxis, 5, integer=True)

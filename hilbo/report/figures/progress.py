@@ -32,7 +32,7 @@ __all__ = ["individual_convergence", "population_convergence", "progress_figure"
 @styled
 def individual_convergence(study: Study, cohort: Cohort, progress: Progress) -> Figure:
     """Left: NRMSE of individual optima after each number of trials to their final ones, and to the optimum of half of
-    the other participants. Right: cumulative responses in the highest category.
+    the other participants. Right: cumulative responses that are the goal.
 
     Median and quartiles over participants. Paper, figure 5.
     """
@@ -50,12 +50,12 @@ def individual_convergence(study: Study, cohort: Cohort, progress: Progress) -> 
 
 
 def _top_answers(axes, study: Study, cohort: Cohort, trials: np.ndarray, xlabel: str) -> None:
-    """Draw the cumulative number of responses in the highest category on `axes`: median and quartiles over
+    """Draw the cumulative number of responses that are the goal on `axes`: median and quartiles over
     participants. `trials`: numbers of trials.
     """
-    top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
+    top = np.asarray((cohort.trials.q == study.goal.category) & cohort.trials.mask)
     band(axes, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
-    axes.set(xlabel=xlabel, ylabel=f'answers "{plain(study.responses[-1])}" so far', ylim=(0, None))
+    axes.set(xlabel=xlabel, ylabel=f'answers "{plain(study.goal_label)}" so far', ylim=(0, None))
     axes.legend(frameon=False, loc="upper left")
     few_ticks(axes.yaxis, 5, integer=True)
     few_ticks(axes.xaxis, 6, integer=True)

@@ -31,8 +31,8 @@ from hilbo.report.figures.style import (
 )
 from hilbo.search.apart import nrmse
 from hilbo.study.analysis.analysis import Analysis
+from hilbo.study.analysis.best_mid_worst import Sets
 from hilbo.study.analysis.progress import Progress
-from hilbo.study.analysis.tolerance import Sets
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 

@@ -4,11 +4,14 @@ Maps use cividis and lines the Okabe-Ito colours, which people with colour-blind
 does so by shape too. Widths are those of one and of two columns of a journal.
 """
 
+import io
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.textpath import TextPath
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from hilbo.study.config import Study
@@ -54,11 +57,21 @@ styled = mpl.rc_context(STYLE)
 _WIDEST = 1.1  # inches of an entry of a legend
 
 
+class NotebookFigure(Figure):
+    """A figure that a notebook shows at the end of a cell, although pyplot does not know it."""
+
+    def _repr_png_(self) -> bytes:
+        """PNG at 150 dots an inch; IPython calls it."""
+        content = io.BytesIO()
+        self.savefig(content, format="png", dpi=150)
+        return content.getvalue()
+
+
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **subplots: Any) -> tuple[Figure, Any]:
-    """A matplotlib figure (inches) and its axes, one or an array, as `Figure.subplots` returns them; not shown, and no
-    part of pyplot. `subplots`: further arguments of `Figure.subplots`.
+    """A matplotlib figure (inches) and its axes, one or an array, as `Figure.subplots` returns them; not shown but by a
+    notebook, and no part of pyplot. `subplots`: further arguments of `Figure.subplots`.
     """
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = NotebookFigure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, columns, **subplots)
 
 
@@ -72,8 +85,26 @@ def few_ticks(axis, count: int = 4, *, integer: bool = False) -> None:
 def legend(figure, handles) -> None:
     """Put a legend of these handles above the axes of a figure, in as many columns as its width allows."""
     across = max(1, min(len(handles), int(figure.get_figwidth() / _WIDEST)))
-    size = STYLE["legend.fontsize"]
+    size, labels = STYLE["legend.fontsize"], [handle.get_label() for handle in handles]
+    while across > 1 and _legend_width(labels, across, size) > 72 * figure.get_figwidth():
+        across -= 1
     figure.legend(handles=handles, loc="outside upper center", ncols=across, frameon=False, fontsize=size)
+
+
+def _legend_width(labels: Sequence[str], across: int, size: float) -> float:
+    """Width (points) of a legend with `across` columns and text of `size` points: widest labels, handles, spacing."""
+    look = mpl.rcParams
+
+    def width(line: str) -> float:
+        return TextPath((0, 0), line, size=size).get_extents().width if line.strip() else 0.0
+
+    columns = np.array_split(np.array(labels, dtype=object), across)
+    widest = [max((width(line) for label in column for line in label.split("\n")), default=0.0) for column in columns]
+    spaces = (
+        across * (look["legend.handlelength"] + look["legend.handletextpad"])
+        + (across - 1) * look["legend.columnspacing"]
+    )
+    return sum(widest) + size * (spaces + 2 * look["legend.borderpad"])
 
 
 def plain(words: str) -> str:

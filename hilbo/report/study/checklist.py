@@ -103,8 +103,10 @@ def _posterior(analysis, content):
     """Sentence with the optimum, its latent score and standard deviation."""
     best = content["optimum"]
     where = ", ".join(f"{name} {number(value)}" for name, value in best["parameters"].items())
+    study = analysis.study
+    definition = RULES[study.rule].optimum_for(study.goal_label, study.goal.is_highest)
     return (
-        f"The optimum is, among what may be presented, {RULES[analysis.study.rule].sought}: {where}; latent score"
+        f"The optimum is, among the stimuli that may be presented, {definition}: {where}; latent score"
         f" {best['mean']:.2f} ± {best['sd']:.2f} (standard deviation); tolerance intervals with bootstrap resamples of"
         " the people above."
     )

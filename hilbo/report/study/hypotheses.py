@@ -23,22 +23,24 @@ from hilbo.report.results import misses
 from hilbo.report.validation import Validated, safest
 from hilbo.study.analysis.analysis import Analysis
 from hilbo.study.analysis.heterogeneity import how_aggregated
+from hilbo.study.folder import Reference
 
 __all__ = ["Evidence", "Hypothesis", "Results", "hypotheses"]
 
 Side = Literal["supports", "contradicts", "inconclusive"]
 _NEAR = 0.05
+_STAGED = ("II", "III")
+"""Tables of the sets best, mid and worst."""
 _SAME = 1e-9  # rounding: numbers that are as near as this are equal
 
 
 class Results(NamedTuple):
-    """Results of one material, with its validation and its reference set (d,) in the unit cube, or None."""
+    """Results of one material, with its validation and its reference, or None."""
 
     name: str
     analysis: Analysis
     validated: Validated | None
-    reference: np.ndarray | None
-    reference_name: str
+    reference: Reference | None
 
 
 class Evidence(NamedTuple):
@@ -110,15 +112,15 @@ def _difference(values: np.ndarray) -> _Difference:
 
 
 def _individuals(results):
-    """Generate the evidence for H1: approach to the other participants' optimum, highest responses over the session,
-    and the likeliest response at the individual optima.
+    """Generate the evidence for H1: approach to the other participants' optimum, responses that are the goal over the
+    session, and the likeliest response at the individual optima.
     """
     analysis, study = results.analysis, results.analysis.study
     counts = analysis.progress.counts
-    top, people = study.responses[-1], len(analysis.cohort.names)
+    top, people = study.goal_label, len(analysis.cohort.names)
     if analysis.progress.splits and len(counts) > 2:
         yield _nearer_to_others(analysis.progress)
-    answers = np.asarray(analysis.cohort.trials.q) == len(study.responses) - 1
+    answers = np.asarray(analysis.cohort.trials.q) == study.goal.category
     mask = np.asarray(analysis.cohort.trials.mask)
     totals = (answers & mask).sum(axis=1)
     spread = f" ± {totals.std(ddof=1):.2f}" if people > 1 else ""
@@ -135,12 +137,12 @@ def _individuals(results):
         f" {more} (supports: an interval above 0).",
     )
     chances = np.asarray(analysis.aggregate.individuals.class_probabilities)
-    sides = [_largest(row, -1) for row in chances]
+    sides = [_largest(row, study.goal.category) for row in chances]
     likeliest, unlike = sides.count("supports"), sides.count("contradicts")
     yield Evidence(
         "supports" if likeliest > people / 2 else "contradicts" if unlike > people / 2 else "inconclusive",
         f'At their own optimum "{top}" is the likeliest answer for {likeliest} of {people} participants (median'
-        f" probability {100 * np.median(chances[:, -1]):.0f} %; supports: more than half of them).",
+        f" probability {100 * np.median(chances[:, study.goal.category]):.0f} %; supports: more than half of them).",
     )
 
 
@@ -165,20 +167,20 @@ def _early(counts):
 
 
 def _population(results):
-    """Generate the evidence for H2: distance of the optimum to the reference, probability of the highest response
+    """Generate the evidence for H2: distance of the optimum to the reference, probability of the goal
     there, and the validation.
     """
     analysis, study = results.analysis, results.analysis.study
     best = analysis.aggregate.optimum
     if results.reference is not None:
-        ours, _ = misses(study, best.x, results.reference)
-        individual_misses, _ = misses(study, analysis.aggregate.individuals.x, results.reference)
-        mean, _ = misses(study, analysis.aggregate.mean_of_optima, results.reference)
+        ours, _ = misses(study, best.x, results.reference.x)
+        individual_misses, _ = misses(study, analysis.aggregate.individuals.x, results.reference.x)
+        mean, _ = misses(study, analysis.aggregate.mean_of_optima, results.reference.x)
         low, middle, high = np.percentile(individual_misses, [25, 50, 75])
         farther = _difference(100 * (np.asarray(individual_misses) - float(ours)))
         yield Evidence(
             farther.side if farther.side != "supports" or mean > ours else "inconclusive",
-            f"From {results.reference_name} the population optimum is {100 * ours:.1f} % away (NRMSE), the individual"
+            f"From {results.reference.name} the population optimum is {100 * ours:.1f} % away (NRMSE), the individual"
             f" optima {100 * middle:.0f} % (median; quartiles {100 * low:.0f} and {100 * high:.0f} %), their mean"
             f" {100 * mean:.1f} %; individual optima are farther by {farther} on average"
             " (supports: an interval above 0, and their mean is farther too).",
@@ -187,34 +189,35 @@ def _population(results):
     if results.validated is None:
         yield Evidence("inconclusive", "No validation session asked people again.")
         return
-    yield from _validation(results.validated, study.responses)
+    yield from _validation(results.validated, study)
 
 
 def _likeliest(analysis):
-    """Evidence whether a new participant's likeliest response at the optimum is the highest one, with all of its
+    """Evidence whether a new participant's likeliest response at the optimum is the goal, with all of its
     probability's 95 % interval.
     """
-    highest, top = analysis.population.highest, analysis.study.responses[-1]
+    highest, goal = analysis.population.highest, analysis.study.goal
     if highest is None:
         words = f"The rule {analysis.study.rule} does not predict a new participant's answers."
         return Evidence("inconclusive", words)
     chances = np.asarray(analysis.aggregate.optimum.class_probabilities)
-    side = _largest(chances, -1)
-    if side == "supports" and highest.low <= np.delete(chances, -1).max():
+    side = _largest(chances, goal.category)
+    if side == "supports" and highest.low <= np.delete(chances, goal.category).max():
         side = "inconclusive"
     return Evidence(
         side,
-        f'At the population optimum a new participant answers "{top}" with a probability of {highest.probability:.0%}'
-        f" (95 % interval {highest.low:.0%} to {highest.high:.0%}; supports: more likely than any other answer).",
+        f'At the population optimum a new participant answers "{analysis.study.goal_label}" with a probability of'
+        f" {highest.probability:.0%} (95 % interval {highest.low:.0%} to {highest.high:.0%}; supports: more likely"
+        " than any other answer).",
     )
 
 
-def _validation(validated, responses):
+def _validation(validated, study, numbers=("II", "III", "IV")):
     """Generate the evidence of the validation sessions for H2: the confusion matrix, for three responses, and
-    coefficients of tables II to IV, as far as there are such.
+    coefficients of the tables of these `numbers`, as far as there are such.
     """
-    counts = validated.tables.confusion.to_numpy()
-    if len(counts) == 3 and counts.sum(axis=1).all() and len(responses) == 3:
+    counts, responses, goal = validated.tables.confusion.to_numpy(), study.responses, study.goal_label
+    if study.goal.is_highest and len(counts) == 3 and counts.sum(axis=1).all() and len(responses) == 3:
         sides = [_largest(row, place) for place, row in enumerate(counts)]
         yield Evidence(
             "contradicts" if "contradicts" in sides else "inconclusive" if "inconclusive" in sides else "supports",
@@ -223,13 +226,13 @@ def _validation(validated, responses):
             " (supports: each is the most frequent answer to its set).",
         )
     for number, term, words, sign in (
-        ("II", "Best", f'the best set is called "{responses[-1]}" more often than the others', 1),
-        ("III", "Best", "the best set differs from the mid set, towards the highest answer", -1),
-        ("III", "Worst", "the worst set differs from the mid set, towards the lowest answer", 1),
+        ("II", "Best", f'the best set is called "{goal}" more often than the others', 1),
+        ("III", "Best", f'the best set differs from the mid set, towards "{goal}"', -1),
+        ("III", "Worst", f'the worst set differs from the mid set, away from "{goal}"', 1),
         ("IV", "Aggregate-Best", "the aggregate's set is preferred to individuals' own", 1),
     ):
         table = validated.regressions().get(number)
-        if table is None:
+        if table is None or number not in numbers:
             continue
         rows = safest(table).set_index("term")
         if term not in rows.index:
@@ -268,13 +271,13 @@ def _convergence(results):
     )
     if results.reference is not None:
         miss = [
-            float(misses(analysis.study, x, results.reference)[0])
+            float(misses(analysis.study, x, results.reference.x)[0])
             for x in (analysis.progress.population[row], analysis.progress.population[-1])
         ]
         yield Evidence(
             "supports" if miss[0] <= miss[1] + _NEAR else "contradicts",
             f"The optimum of everybody's first {progress.counts[row]} answers is {100 * miss[0]:.1f} % from"
-            f" {results.reference_name}, that of all {100 * miss[1]:.1f} %{how}"
+            f" {results.reference.name}, that of all {100 * miss[1]:.1f} %{how}"
             f" (supports: at most {100 * _NEAR:.0f} % more).",
         )
 
@@ -284,7 +287,11 @@ def _materials(results):
     if len(results) < 2:
         yield Evidence("inconclusive", "One material was studied.")
     for one in results[1:]:
-        items = [*_near(one), *([] if one.validated is None else _preferred(one.name, one.validated))]
+        items = list(_near(one))
+        if one.validated is not None:
+            own = _validation(one.validated, one.analysis.study, _STAGED)
+            items += [Evidence(item.side, f"{one.name}: {item.text}") for item in own]
+            items += _preferred(one.name, one.validated)
         words = f"{one.name}: there is no reference, and no decided comparison of the map's set with individuals'."
         yield from items or [Evidence("inconclusive", words)]
 
@@ -296,12 +303,12 @@ def _near(one):
     if one.reference is None:
         return
     analysis = one.analysis
-    ours = float(misses(analysis.study, analysis.aggregate.optimum.x, one.reference)[0])
-    individual_misses = np.asarray(misses(analysis.study, analysis.aggregate.individuals.x, one.reference)[0])
+    ours = float(misses(analysis.study, analysis.aggregate.optimum.x, one.reference.x)[0])
+    individual_misses = np.asarray(misses(analysis.study, analysis.aggregate.individuals.x, one.reference.x)[0])
     farther = _difference(100 * (individual_misses - ours))
     yield Evidence(
         farther.side,
-        f"{one.name}: the population optimum is {100 * ours:.1f} % from {one.reference_name}, the median individual one"
+        f"{one.name}: the population optimum is {100 * ours:.1f} % from {one.reference.name}, the median individual one"
         f" {100 * float(np.median(individual_misses)):.0f} %, farther by {farther} on average (supports: an interval"
         " above 0).",
     )

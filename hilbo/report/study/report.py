@@ -23,7 +23,9 @@ from hilbo.report.study.checklist import checklist
 from hilbo.report.study.comparison import comparison_section, comparison_table
 from hilbo.report.study.dictionary import dictionary
 from hilbo.report.study.hypotheses import Results, hypotheses
+from hilbo.report.study.key_numbers import key_numbers, key_numbers_table, key_numbers_words
 from hilbo.report.study.result_tables import alternatives_table, convergence_table, table_1, tolerance_table
+from hilbo.report.study.sessions import SESSIONS_HEAD, described, session_rows
 from hilbo.report.study.study_figures import comparison_figures, study_figures
 from hilbo.report.validation import Validated, folder_names, named_warnings, validate
 from hilbo.study.analysis.analysis import Analysis, analyse, moved_by_evidence
@@ -47,12 +49,14 @@ def write_study(
     say: Callable[[str], None] = lambda text: None,
     analyses: Mapping[str, Analysis] | None = None,
     comparison: bool = True,
+    people: Mapping[str, Mapping[str, str]] | None = None,
 ) -> dict[str, Any]:
     """Analyse a study's folder and write the results of `hilbo report` into the existing folder `out`; return the
     content of result.json.
 
     `say`: called with a text at each step; `analyses`: finished analyses by name of the material, which are not
-    repeated; `comparison`: whether the other ones also compare the aggregation methods. Raises `InputError` for data
+    repeated; `comparison`: whether the other ones also compare the aggregation methods; `people`: participant -> row of
+    participants.csv, of which only a summary is written. Raises `InputError` for data
     that cannot be analysed.
     """
     results, contents, sections = [], {}, []
@@ -68,7 +72,7 @@ def write_study(
             material.study, material.cohort, seed, tell, comparison=comparison
         )
         validated = _validated(material, folder, tell)
-        results.append(Results(material.name, analysis, validated, material.reference, material.reference_name))
+        results.append(Results(material.name, analysis, validated, material.reference))
         material_folder = out / folders[material.name] if len(folder.materials) > 1 else out
         material_folder.mkdir(exist_ok=True)
         tell("figures and tables")
@@ -77,6 +81,7 @@ def write_study(
         sections.append(section)
     claims = hypotheses(results) if folder.study.file.report.hypotheses else []
     content = _content(folder, contents, claims, seed)
+    content["people"] = None if people is None else described(people, _everybody(folder))
     write_result(content, out)
     say("the page")
     page = _page(folder, content, sections, claims, comparison)
@@ -103,7 +108,17 @@ def _page(folder: StudyFolder, content, sections, claims, compares: bool) -> str
         left_out=len(answered) - len(kept),
         compares=compares,
         hypotheses=claims,
+        sessions=session_rows(folder.sessions or ()),
+        sessions_head=SESSIONS_HEAD,
     )
+
+
+def _everybody(folder: StudyFolder) -> list[str]:
+    """All participants with responses, of optimisations or validations."""
+    names = [name for material in folder.materials for name in material.cohort.names]
+    for material in folder.materials:
+        names += [] if material.validation is None else list(material.validation["participant"])
+    return list(dict.fromkeys(names))
 
 
 def _content(folder: StudyFolder, contents, claims, seed) -> dict[str, Any]:
@@ -127,7 +142,7 @@ def _validated(material: Material, folder: StudyFolder, say) -> Validated | None
         return None
     say("validation sessions")
     name = material.name if "material" in material.validation and material.name else None
-    return validate(material.validation, folder.sets, material.study.responses, name)
+    return validate(material.validation, folder.sets, material.study.responses, name, material.study.goal_label)
 
 
 def _write_material(material, analysis: Analysis, validated, folder: Path, seed):
@@ -135,12 +150,14 @@ def _write_material(material, analysis: Analysis, validated, folder: Path, seed)
     figures and tables. Return its content for result.json, and its section of the page.
     """
     study, people = analysis.study, people_of(analysis.study, analysis.aggregate)
-    truth = material.reference if material.reference_name == "the truth" else None
+    reference = material.reference
+    truth = reference.x if reference is not None and reference.name == "the truth" else None
     content = cohort_content(analysis.population, truth, people)
     data = groups(study, analysis.cohort, analysis.aggregate.posteriors, seed=seed)
     write_groups(data, folder / "inference.nc")
     write_grid(content, map_dataset(study, analysis.aggregate.surface), folder)
     tables = _tables(analysis, material, content, people)
+    tables["key_numbers"] = key_numbers_table(analysis, key_numbers(analysis, validated, reference))
     shares = predictive_shares(data, len(study.responses))
     figures, hatched = study_figures(analysis, material, shares)
     pictures = save_figures(figures, folder)
@@ -160,6 +177,7 @@ def _write_material(material, analysis: Analysis, validated, folder: Path, seed)
         "limits": list(analysis.limits),
         "optimised": _optimised(analysis),
         "tolerance": tables["tolerance"].to_dict("records"),
+        "key_numbers": tables["key_numbers"].to_dict("records"),
         "comparison": analysis.comparison,
     }
     section = _section(material, analysis, validated, tables, pictures, content)
@@ -212,7 +230,8 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "typical": analysis.cohort.names[typical_person(analysis)],
         "unknown": UNKNOWN,
         "how": how_aggregated(analysis.aggregate.map),
-        "reference": None if material.reference is None else material.reference_name,
+        "reference": None if material.reference is None else material.reference.name,
+        "key_numbers": key_numbers_words(tables["key_numbers"]),
         "table_1": _with_units(analysis.study, tables["table_I"]),
         "alternatives": _alternatives(analysis.study, tables["alternatives"]),
         "tolerance": _tolerances(tables["tolerance"].replace({"hyperparameters": words})),
@@ -236,7 +255,7 @@ def _alternatives(study: Study, table: pd.DataFrame) -> dict[str, Any]:
     forms: dict[str, tuple[str, Any]] = {
         "mean": ("latent score", "{:.2f}".format),
         "sd": ("sd", "{:.2f}".format),
-        "p_top": (f'P("{study.responses[-1]}")', percent),
+        "p_top": (f'P("{study.goal_label}")', percent),
         "passivity_margin": ("passivity margin (N·s/m)", "{:+.3f}".format),
     }
     shown = table.dropna(axis=1, how="all").drop(columns="optimum")

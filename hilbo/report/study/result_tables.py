@@ -10,17 +10,18 @@ from hilbo.population.rules.registry import RULES
 from hilbo.report.results import moved
 from hilbo.search.rendering import Rendering
 from hilbo.study.analysis.analysis import Analysis
+from hilbo.study.folder import Reference
 
 __all__ = ["alternatives_table", "convergence_table", "table_1", "tolerance_table"]
 
 
-def table_1(analysis: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
+def table_1(analysis: Analysis, reference: Reference | None) -> pd.DataFrame:
     """Population optimum and mean of the individual optima, by parameter, next to the reference if there is one (paper,
     table I). Columns `parameter`, `reference`, `aggregate`, `mean_of_optima`, `sd_of_optima`, `error_percent`,
     `mean_error_percent`.
 
-    `reference` (d,): the known parameter set, in the unit cube; None leaves its column and the errors out. Errors are
-    absolute, in per cent of the range; the standard deviation is NaN for one participant and for levels.
+    `reference`: None leaves its column and the errors out. Errors are absolute, in per cent of the range; the standard
+    deviation is NaN for one participant and for levels.
     """
     study, aggregate = analysis.study, analysis.aggregate
     mean, best = aggregate.mean_of_optima, aggregate.optimum.x
@@ -32,9 +33,9 @@ def table_1(analysis: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
     spread = individual_sets.std(ddof=1, numeric_only=True)  # NaN of one; levels have none
     table["sd_of_optima"] = [spread.get(name, np.nan) for name in ours]
     if reference is not None:
-        table.insert(1, "reference", list(Rendering.at(study.space, reference).shown.values()))
+        table.insert(1, "reference", list(Rendering.at(study.space, reference.x).shown.values()))
         for name, x in (("error_percent", best), ("mean_error_percent", mean)):
-            ways = moved(study, x, jnp.asarray(reference))["moved"]
+            ways = moved(study, x, jnp.asarray(reference.x))["moved"]
             table[name] = [abs(ways[parameter]["percent"]) for parameter in ours]
     return table
 
@@ -42,13 +43,13 @@ def table_1(analysis: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
 def convergence_table(analysis: Analysis) -> pd.DataFrame:
     """After each number of trials (paper, figures 5 and 7b): NRMSE of the population's optimum to its last, of
     individual optima to theirs (median, quartiles), of both to the optimum of half of the participants, and cumulative
-    responses in the highest category (median, quartiles).
+    responses that are the goal (median, quartiles).
 
     The columns on halves are missing if there were too few participants to split.
     """
     study, counts = analysis.study, analysis.progress.counts
     population_errors, individual_errors = analysis.progress.to_end()
-    top = np.asarray((analysis.cohort.trials.q == len(study.responses) - 1) & analysis.cohort.trials.mask)
+    top = np.asarray((analysis.cohort.trials.q == study.goal.category) & analysis.cohort.trials.mask)
     so_far = np.cumsum(top, axis=1)[:, counts - 1]
     table = pd.DataFrame({"trials": counts, "population": population_errors})
     if analysis.progress.splits:
@@ -65,7 +66,7 @@ def tolerance_table(analysis: Analysis) -> pd.DataFrame:
     """Tolerance intervals by parameter under fixed and under optimised hyperparameters, with bootstrap intervals of
     their ends (paper, section VII).
 
-    An interval is NaN where the highest response is not the likeliest at the optimum; `draws_without`: share of
+    An interval is NaN where the goal is not the likeliest response at the optimum; `draws_without`: share of
     resamples without an interval, 1 where no resample had one.
     """
     rows = []
@@ -93,7 +94,7 @@ def tolerance_table(analysis: Analysis) -> pd.DataFrame:
 
 def alternatives_table(analysis: Analysis) -> pd.DataFrame:
     """All estimates that could be presented as the optimum, a row each: parameters, latent score (mean, sd),
-    probability of the highest response, and with mechanics the passivity margin (N·s/m; negative is not passive).
+    probability of the goal, and with mechanics the passivity margin (N·s/m; negative is not passive).
 
     Means of optima and sets have no score. Only methods that predict a new participant (`Rule.predicts`) have the
     probability.
@@ -114,6 +115,6 @@ def alternatives_table(analysis: Analysis) -> pd.DataFrame:
         if optimum is not None:
             row |= {"mean": float(optimum.mean), "sd": float(optimum.sd)}
             rule = RULES.get(name.removeprefix("population, "), RULES[study.rule])
-            row["p_top"] = float(optimum.class_probabilities[-1]) if rule.predicts else None
+            row["p_top"] = float(optimum.class_probabilities[study.goal.category]) if rule.predicts else None
         rows.append(row if study.space.mechanics is None else row | {"passivity_margin": rendering.margin})
     return pd.DataFrame(rows)

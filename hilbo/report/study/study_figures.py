@@ -30,7 +30,7 @@ def study_figures(
 
     chosen, cohort, aggregate, progress = analysis.study, analysis.cohort, analysis.aggregate, analysis.progress
     best, prior = np.asarray(aggregate.optimum.x), aggregate.map.map_prior
-    references = {} if material.reference is None else {material.reference_name: material.reference}
+    references = {} if material.reference is None else {material.reference.name: material.reference.x}
     regions = {
         f"hyperparameters: {label}": reading
         for label, reading in zip(analysis.hyperparameters.labels, (analysis.fixed, analysis.optimised), strict=True)

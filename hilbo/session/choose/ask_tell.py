@@ -173,8 +173,8 @@ class Session:
         return fit(self.study.gp, self.trials, inference=self.study.inference)
 
     def best(self) -> dict[str, Any]:
-        """The rendering with the largest posterior mean, in the form of `ask`; computed with a fit. Raises `InputError`
-        before the first answer, when the prior mean is the same everywhere."""
+        """The optimum of the posterior, for the highest response its largest mean, in the form of `ask`; computed with
+        a fit. Raises `InputError` before the first answer, when the prior mean is the same everywhere."""
         if not len(self.answers):
             raise InputError("Session: there are no answers yet, and so no best rendering; tell one first.")
         return self._named(self.step.best(self.posterior()))

@@ -200,6 +200,8 @@ class _Prediction(NamedTuple):
     unit: Float[Array, " d"]
     mean: Float[Array, ""]
     variance: Float[Array, ""]
+    closeness: Float[Array, ""]
+    """Of the mean to the goal."""
     probabilities: Float[Array, " c"]
     certificate: Any
 
@@ -210,7 +212,8 @@ def _prediction(study: Study, posterior: Posterior, point: Float[Array | np.ndar
     unit = study.space.to_unit(point)
     mean, variance = (moment[0] for moment in posterior.predict(unit[None, :]))
     probabilities = study.gp.likelihood.class_probabilities(mean, variance)
-    return _Prediction(unit, mean, variance, probabilities, posterior.certificate)
+    closeness = study.goal.closeness(study.gp.likelihood, mean)
+    return _Prediction(unit, mean, variance, closeness, probabilities, posterior.certificate)
 
 
 def explained(study: Study, posterior: Posterior, point: Float[np.ndarray, " d"], by: str) -> dict[str, Any]:
@@ -229,7 +232,7 @@ def explained(study: Study, posterior: Posterior, point: Float[np.ndarray, " d"]
         "unit": predicted.unit.tolist(),
         "mean": mean,
         "sd": sd,
-        "score": mean + study.file.selection.weight * sd if by.startswith("ucb") else None,
+        "score": float(predicted.closeness) + study.file.selection.weight * sd if by.startswith("ucb") else None,
         "probabilities": dict(zip(study.responses, predicted.probabilities.tolist(), strict=True)),
         "margin": rendering.margin,
         "certificate": {f.name: getattr(certificate, f.name).item() for f in dataclasses.fields(certificate)},

@@ -4,22 +4,25 @@
         while (point := session.ask()) is not None:
             session.tell(felt(point))
 
-An existing log with the same header is resumed, with exactly the same next rendering.
+An existing log with the same header is resumed, with exactly the same next rendering, also after the study file has
+changed in what responses do not depend on.
 """
 
 import os
 import time
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from hilbo.errors import InputError
 from hilbo.session.choose.look_ahead import LiveChooser
 from hilbo.session.log import actions as live
 from hilbo.session.log.event_log import EventLog
+from hilbo.session.log.header_check import protocol_of
 from hilbo.session.log.log_files import begun, check_alone, check_new, log_name
 from hilbo.session.log.records import Header
 from hilbo.session.log.state import LiveSession
 from hilbo.study.config import Study
-from hilbo.study.file.protocols import protocol
 
 __all__ = ["LoggedSession"]
 
@@ -32,8 +35,8 @@ class LoggedSession:
 
     @classmethod
     def open(cls, folder: str | os.PathLike, study: Study, header: Header) -> "LoggedSession":
-        """Begin a session in `folder`, or resume the one with this participant and label; the log is locked until
-        `close`.
+        """Begin a session in `folder`, or resume the one with this participant and label, with the study file that it
+        was begun with; the log is locked until `close`.
 
         Raises InputError if the log was begun with another header, is in use or damaged, or another session of the
         participant is running; a log created by this call is then deleted.
@@ -50,7 +53,7 @@ class LoggedSession:
             if new:
                 path.unlink()
             raise
-        if log.state.header != header:
+        if not _asked_alike(log.state.header, header):
             log.close()
             raise InputError(f"{path}: was begun with another seed, plan or sets; give those, or another label.")
         return cls(log, LiveChooser(log.state))
@@ -78,7 +81,7 @@ class LoggedSession:
         trial = self.state.pending
         if trial is None:
             raise InputError("nothing has been asked; call ask() first.")
-        asks = protocol(self.state.study.session, self.state.header.blocks[trial.block].phase).asks
+        asks = protocol_of(self.state.study, self.state.header.blocks[trial.block]).asks
         values = {asks[0]: response} | others
         event = live.answer(self.state, trial.id, f"script-{trial.id}", values, time.time(), felt=False)
         assert event is not None  # the trial is pending
@@ -93,3 +96,17 @@ class LoggedSession:
 
     def __exit__(self, *_) -> None:
         self.close()
+
+
+def _asked_alike(begun: Header, header: Header) -> bool:
+    """Whether the header of a log is the one that is asked for. Of another version of the study file, what that
+    determines is not compared: language, warm-up, and numbers of trials that are chosen."""
+
+    def fixed(of: Header) -> Header:
+        blocks = tuple(replace(block, count=0, rest=0.0) for block in of.blocks if block.phase != "warm-up")
+        sets = {name: values for name, values in of.sets.items() if not name.startswith("warm-up ")}
+        return replace(of, study="", study_tables={}, language="", versions={}, blocks=blocks, sets=sets)
+
+    if begun.study == header.study:
+        return replace(begun, study_tables={}) == replace(header, study_tables={})
+    return fixed(begun) == fixed(header)

@@ -131,7 +131,7 @@ class LiveChooser:
             return self._fitted[key]
 
     def best(self, block: int, fitted: Fitted) -> Float[np.ndarray, " d"]:
-        """Point (d,) with the largest posterior mean, in physical units; nothing is fitted."""
+        """Optimum (d,) of the posterior, in physical units; nothing is fitted."""
         return self._session(block).step.best(fitted.posterior)
 
     def _session(self, block: int) -> Session:

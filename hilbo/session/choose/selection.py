@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo import acquisition
 from hilbo.kernels import gram
+from hilbo.likelihoods import Goal
 from hilbo.numerics.climbing import Choice, climb, spread
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.search.apart import differences
@@ -43,12 +44,13 @@ class Choosing(eqx.Module):
     space: SearchSpace
     inference: Inference = eqx.field(static=True)
     selection: Selection = eqx.field(static=True)
+    goal: Goal = eqx.field(static=True)
 
     @classmethod
     def of(cls, study: Study) -> "Choosing":
         """Part of a study that choices depend on; numbers that are no part of a program are set to 0."""
         selection = msgspec.structs.replace(study.file.selection, space_filling=0, weight=0.0)
-        return cls(study.gp, study.space, study.inference, selection)
+        return cls(study.gp, study.space, study.inference, selection, study.goal)
 
 
 class Design(eqx.Module):
@@ -104,7 +106,7 @@ def point_after(
         points, usable = _searched(plan, _JOINT_CANDIDATES if thompson else None)
         allowed = _keeps_distance(choosing.gp.kernel.levels, posterior.trials, points, usable, distance)
     if thompson:
-        return _thompson_point(posterior, plan, trial, allowed)
+        return _thompson_point(choosing, posterior, plan, trial, allowed)
     return _highest(choosing, plan, posterior, _score(choosing, posterior, weight), allowed).x
 
 
@@ -118,7 +120,9 @@ def point_away_from(
         """Whether the point x (d,) keeps the distance."""
         return jnp.all(jnp.sum(differences(study.gp.kernel.levels, excluded, x[None, :]) ** 2, axis=1) >= distance**2)
 
-    return _highest(Choosing.of(study), plan, posterior, acquisition.UCB(study.file.selection.weight), allowed).x
+    choosing = Choosing.of(study)
+    score = _towards(choosing, acquisition.UCB(study.file.selection.weight))
+    return _highest(choosing, plan, posterior, score, allowed).x
 
 
 def _highest(
@@ -155,11 +159,19 @@ def _score(choosing: Choosing, posterior: Posterior, weight: ArrayLike) -> Optim
     """The study's acquisition as a function of mean and variance; `weight`: of the standard deviation, for UCB only."""
     kind = choosing.selection.acquisition
     if kind == "ucb":
-        return acquisition.UCB(weight)
+        return _towards(choosing, acquisition.UCB(weight))
     if kind == "log_ei":
         trials = posterior.trials
-        return acquisition.LogEI(jnp.max(jnp.where(trials.mask, posterior.mean(trials.x), -jnp.inf)))
-    return acquisition.TopCategory(choosing.gp.likelihood.thresholds[-1], choosing.gp.likelihood.noise)
+        near = choosing.goal.closeness(choosing.gp.likelihood, posterior.mean(trials.x))
+        return _towards(choosing, acquisition.LogEI(jnp.max(jnp.where(trials.mask, near, -jnp.inf))))
+    if choosing.goal.is_highest:
+        return acquisition.TopCategory(choosing.gp.likelihood.thresholds[-1], choosing.gp.likelihood.noise)
+    return acquisition.InCategory(choosing.gp.likelihood, choosing.goal.category)
+
+
+def _towards(choosing: Choosing, score: acquisition.UCB | acquisition.LogEI) -> OptimisticScore:
+    """The score by closeness to the study's goal; of the highest response that is the score itself."""
+    return score if choosing.goal.is_highest else acquisition.TowardsGoal(score, choosing.goal, choosing.gp.likelihood)
 
 
 def _searched(plan: Design, count: int | None) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:
@@ -194,19 +206,21 @@ def _keeps_distance(
 
 
 def _thompson_point(
+    choosing: Choosing,
     posterior: Posterior,
     plan: Design,
     trial: Int[Array, ""] | int,
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None,
 ) -> Float[Array, " d"]:
-    """Point (d,) at which a joint posterior draw is largest, among the candidates that are allowed (None: all). The
-    draw is seeded by the design's key and `trial`."""
+    """Point (d,) at which a joint posterior draw is closest to the goal, among the candidates that are allowed (None:
+    all). The draw is seeded by the design's key and `trial`."""
     assert plan.candidates is not None
     points = plan.candidates[:_JOINT_CANDIDATES]
     cross = gram(posterior.gp.kernel, points, posterior.trials.x)
     covariance = gram(posterior.gp.kernel, points, points) - cross @ posterior.latent.inverse @ cross.T
     key = jax.random.fold_in(plan.key, trial)
     row, draw = acquisition.thompson(key, cross @ posterior.latent.weights, covariance)
-    if allowed is not None:
-        row = jnp.argmax(jnp.where(jax.vmap(allowed)(points), draw, -jnp.inf))
+    if allowed is not None or not choosing.goal.is_highest:
+        near = choosing.goal.closeness(choosing.gp.likelihood, draw)
+        row = jnp.argmax(near if allowed is None else jnp.where(jax.vmap(allowed)(points), near, -jnp.inf))
     return points[row]

@@ -92,11 +92,12 @@ class Step:
         return Fitted(point, _certified(posterior) if self._study.inference == "laplace" else posterior)
 
     def best(self, posterior: Posterior) -> Float[np.ndarray, " d"]:
-        """Point (d,) with the largest mean of a posterior of this study, in physical units; nothing is fitted."""
+        """Optimum (d,) of a posterior of this study, for the highest response its largest mean, in physical units;
+        nothing is fitted."""
         query = self._blank.copy()
         query[_GIVEN] = 1.0
         packed = jax.device_put(self._layout.vector(posterior))
-        return self._physical(self._bound_to_the_mean(query, packed)[: len(self.names)])
+        return self._physical(self._bound_to_the_best(query, packed)[: len(self.names)])
 
     def _physical(self, points: Any) -> Float[np.ndarray, "*n d"]:
         """Points (..., d) from a program as read-only float64, limited to the parameters' ranges: where JAX computes
@@ -135,10 +136,11 @@ class Step:
         return self._bound_by(self._choosing)
 
     @functools.cached_property
-    def _bound_to_the_mean(self) -> "_Bound":
-        """The program that maximises the posterior mean: UCB with weight 0, in most studies the same program as
-        `_bound`."""
-        plain = msgspec.structs.replace(self._choosing.selection, acquisition="ucb", minimum_distance=None)
+    def _bound_to_the_best(self) -> "_Bound":
+        """The program that searches the optimum of a posterior: UCB with weight 0, in most studies the same program as
+        `_bound`, and the probability of a goal between other responses."""
+        kind = "top_category" if self._choosing.goal.is_between else "ucb"
+        plain = msgspec.structs.replace(self._choosing.selection, acquisition=kind, minimum_distance=None)
         return self._bound_by(dataclasses.replace(self._choosing, selection=plain))
 
     def _bound_by(self, choosing: Choosing) -> "_Bound":

@@ -25,7 +25,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hilbo.errors import InputError
 from hilbo.ordinal_gp import Posterior
+from hilbo.population.rules.registry import RULES
 from hilbo.search.apart import differences
 from hilbo.search.candidates import search_points
 from hilbo.study.config import Study
@@ -81,10 +83,11 @@ def warm_point(
     excluded: Float[Array, "k d"] | None = None,
     distance: float = 0.0,
 ) -> Float[Array, " d"]:
-    """The candidate (d,) with the highest UCB after a participant's answers, at least `distance` from the points
-    `excluded` (k, d; None: no condition), all in the unit cube; traceable. If none is that far, the first candidate."""
+    """The candidate (d,) with the highest UCB, by closeness to the goal, after a participant's answers, at least
+    `distance` from the points `excluded` (k, d; None: no condition), all in the unit cube; traceable. If none is
+    that far, the first candidate."""
     mean, variance = informed(study, warm, posterior)
-    score = mean + study.file.selection.weight * jnp.sqrt(variance)
+    score = study.goal.closeness(study.gp.likelihood, mean) + study.file.selection.weight * jnp.sqrt(variance)
     if excluded is not None:
         away = differences(study.gp.kernel.levels, warm.points[:, None, :], excluded[None, :, :])
         squared = jnp.sum(away**2, axis=2)
@@ -94,12 +97,17 @@ def warm_point(
 
 def read_warm_start(path: str | os.PathLike, study: Study, seed: int = 0, share: float = SHARE) -> WarmStart:
     """Read a warm start from the map.nc of a results folder: at its points, or interpolated linearly from its grid at
-    points that are drawn with `seed`; `share` as in `warm_start`. Raises InputError for a map of other parameters, or a
-    damaged file."""
+    points that are drawn with `seed`; `share` as in `warm_start`. Raises InputError for a map of other parameters, for
+    a goal between learnt thresholds, or for a damaged file."""
     from scipy.interpolate import RegularGridInterpolator
 
     from hilbo.study.results.map_netcdf import on_grid, read_map
 
+    if study.goal.is_between and RULES[study.rule].learns:
+        raise InputError(
+            f'{path}: a map by the rule "{study.rule}" has learnt thresholds, which it does not hold, and the goal'
+            f' "{study.goal_label}" is between two of them; start without the map.'
+        )
     grid = read_map(path, study)
     source = digest_of(read_bytes(path))
     mean, variance = np.asarray(grid["mean"]), np.asarray(grid["variance"])

@@ -24,7 +24,6 @@ _TABLES = {
     "validation": validation_table,
     "sets": sets_table,
     "presentations": presentations_table,
-    "sessions": sessions_table,
 }
 
 
@@ -36,7 +35,7 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: StudyFile) ->
     """
     for state in sessions:
         _check_names(state)
-    tables = {kind: make(sessions) for kind, make in _TABLES.items()}
+    tables = {kind: make(sessions) for kind, make in _TABLES.items()} | {"sessions": sessions_table(sessions, study)}
     (folder / "data").mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     columns: dict[str, Any] = {}

@@ -46,7 +46,7 @@ def read_sessions(
     folder: str | os.PathLike, study: StudyFile, note: Callable[[str], object] = lambda sentence: None
 ) -> list[LiveSession]:
     """Read every session in a folder except dry runs, every event checked. `note` is called with sentences on dry runs,
-    and on logs that are incomplete or left out.
+    on logs that are incomplete or left out, and on sessions with another version of the study file.
 
     Raises InputError if there is none, a log is damaged or of another study, or two are of one session.
     """
@@ -65,6 +65,13 @@ def read_sessions(
     if dry:
         note(f"{folder}: {'1 dry run is' if dry == 1 else f'{dry} dry runs are'} left out.")
     _check_once(sessions)
+    changed = {state.study.hash: state.study for state in sessions.values() if state.study.hash != study.hash}
+    for other in changed.values():
+        count = sum(state.study.hash == other.hash for state in sessions.values())
+        note(
+            f"{folder}: {'1 session was' if count == 1 else f'{count} sessions were'} begun with another version of the"
+            f" study file, which differs in {', '.join(study.changes(other))}."
+        )
     return list(sessions.values())
 
 
@@ -190,9 +197,10 @@ def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
     return _table(rows)
 
 
-def sessions_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """Table of sessions, one row each: participant, session, phases, hash of the plan (empty without a plan), seed, and
-    number and longest (s) of the pauses."""
+def sessions_table(sessions: Sequence[LiveSession], study: StudyFile) -> pd.DataFrame:
+    """Table of sessions, one row each: participant, session, phases, hash of the plan (empty without a plan), seed,
+    number and longest (s) of the pauses, times of the first and the last event (s since the epoch), hash of the
+    session's own study file, and the keys in which it differs from `study`."""
     rows = []
     for state in sessions:
         header = state.header
@@ -200,7 +208,9 @@ def sessions_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
         place = {"participant": header.participant, "session": header.session, "phases": phases}
         pauses = [pause.seconds for pause in state.pauses]
         away = {"pauses": len(pauses), "longest_pause": max(pauses, default=0.0)}
-        rows.append(place | {"plan": _written(header.plan or ""), "seed": header.seed} | away)
+        file = {"study": header.study, "differs_in": ", ".join(study.changes(state.study))}
+        plan = {"plan": _written(header.plan or ""), "seed": header.seed}
+        rows.append(place | plan | away | {"began_at": state.began, "ended_at": state.last} | file)
     return pd.DataFrame(rows)
 
 

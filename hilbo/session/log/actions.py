@@ -13,11 +13,10 @@ from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from hilbo.errors import InputError
-from hilbo.session.log.header_check import study_of
+from hilbo.session.log.header_check import protocol_of, study_of
 from hilbo.session.log.presented import check_confirmed
 from hilbo.session.log.records import Event, Need, RefusedError, Trial
 from hilbo.session.log.state import LiveSession
-from hilbo.study.file.protocols import protocol
 from hilbo.study.file.trial_flags import FLAGS, SAMPLES
 from hilbo.study.formats.cell_text import runs_in_a_spreadsheet
 
@@ -379,7 +378,7 @@ def _counts(telemetry: Mapping[str, int]) -> dict[str, int]:
 def _check_values(state: LiveSession, trial: Trial, values: Any) -> None:
     """Raise RefusedError if `values` are not exactly the answers that the trial's phase asks for, each an allowed
     one."""
-    asks = protocol(state.study.session, state.header.blocks[trial.block].phase).asks
+    asks = protocol_of(state.study, state.header.blocks[trial.block]).asks
     if not isinstance(values, Mapping) or set(values) != set(asks):
         raise RefusedError("bad-answer", f"an answer to trial {trial.id} has {', '.join(asks)}, and nothing else.")
     for ask in asks:

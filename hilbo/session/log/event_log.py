@@ -11,8 +11,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import replace
+
 from hilbo.errors import InputError
-from hilbo.session.log.header_check import check_new_header
+from hilbo.session.log.header_check import check_new_header, own_study
 from hilbo.session.log.log_lines import event_line, event_of, header_line, is_unbegun, read_lines
 from hilbo.session.log.records import Event, Header
 from hilbo.session.log.replay import check_types, replayed
@@ -65,13 +67,15 @@ class EventLog:
 
     @classmethod
     def create(cls, path: str | os.PathLike, study: StudyFile, header: Header) -> "EventLog":
-        """Create the log of a new session, with its folder, write and sync the header line, and lock the file.
+        """Create the log of a new session, with its folder, write and sync the header line, and lock the file. The
+        header that is written holds the study file.
 
         A file with nothing but an incomplete header line is overwritten. Raises InputError for a header that is not
         valid, and if there is a log already, it is locked, or it cannot be created; LogError if the header cannot be
         written.
         """
         path = Path(path)
+        header = replace(header, study_tables=study.tables)
         state = LiveSession.start(study, header)
         check_new_header(study, header)
         try:
@@ -97,10 +101,11 @@ class EventLog:
 
     @classmethod
     def resume(cls, path: str | os.PathLike, study: StudyFile) -> "EventLog":
-        """Open and lock an existing log to append to it, and check all of its events.
+        """Open and lock an existing log to append to it, and check all of its events. The session goes on with the
+        study file that it was begun with (`LiveSession.study`).
 
         An incomplete last line is cut off the file, a missing last newline is added. Raises InputError if there is no
-        log, or it is locked, damaged, or of another study.
+        log, or it is locked, damaged, or its responses mean something else than those of `study`.
         """
         path = Path(path)
         try:
@@ -211,24 +216,25 @@ class EventLog:
 def read_log(path: str | os.PathLike, study: StudyFile | None = None) -> tuple[Header, list[Event], str]:
     """Read the header and the events of a log, and a sentence on an incomplete last line ("" if there is none).
 
-    Takes no lock. Checks the lines and, if `study` is given, that the log is of that study, but not whether the events
-    fit the state: see `read_session`. Raises InputError.
+    Takes no lock. Checks the lines and, if `study` is given, that responses mean the same in both, but not whether the
+    events fit the state: see `read_session`. Raises InputError.
     """
     header, events, _, dropped = read_lines(read_bytes(path), path)
     if study is not None:
-        _check_study(path, study, header)
+        _own_study(path, study, header)
     return header, events, dropped
 
 
 def read_session(
     path: str | os.PathLike, study: StudyFile, note: Callable[[str], Any] = lambda sentence: None
 ) -> LiveSession:
-    """Read a log and return the state after its events, each of them checked; takes no lock.
+    """Read a log and return the state after its events, each of them checked, with the study file that the session was
+    begun with; takes no lock.
 
     `note` is called with the sentence on an incomplete last line, if there is one. Raises InputError if the file cannot
-    be read, is damaged, or belongs to another study.
+    be read, is damaged, or its responses mean something else than those of `study`.
     """
-    header, events, dropped = read_log(path, study)
+    header, events, dropped = read_log(path)
     if dropped:
         note(dropped)
     return _folded(path, study, header, events)
@@ -249,21 +255,20 @@ def _repair_end(file: int, path: str | os.PathLike, content: bytes, size: int) -
         raise InputError(f"{path}: cannot be written ({error.strerror}); free some space and try again.") from error
 
 
-def _check_study(path: str | os.PathLike, study: StudyFile, header: Header) -> None:
-    """Raise InputError if the header has the hash of another study; `path` is for the message."""
-    if header.study != study.hash:
-        raise InputError(
-            f"{path}: is the log of another study ({header.study}, not {study.hash}); use the study file that it was"
-            " started with."
-        )
+def _own_study(path: str | os.PathLike, study: StudyFile, header: Header) -> StudyFile:
+    """The study file that the log at `path` was begun with (`own_study`). Raises InputError, with `path`."""
+    try:
+        return own_study(study, header)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def _folded(path: str | os.PathLike, study: StudyFile, header: Header, events: Sequence[Event]) -> LiveSession:
-    """Return the state after the events, each of them checked. Raises InputError, with `path`, also for another
-    study."""
-    _check_study(path, study, header)
+    """Return the state after the events, each of them checked, with the log's own study file. Raises InputError, with
+    `path`, also if responses mean something else than those of `study`."""
+    begun_with = _own_study(path, study, header)
     try:
-        return replayed(study, header, events)
+        return replayed(begun_with, header, events)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -46,8 +46,8 @@ def warm_up(study: StudyFile, seed: int, material: str | None = None) -> tuple[B
     from hilbo.search.rendering import Rendering  # with JAX, which nothing else here needs
     from hilbo.search.space import SearchSpace
 
-    count = protocol(study.session, "warm-up").count
-    box = study_of(study, material).space
+    here = study_of(study, material)
+    count, box = protocol(here.session, "warm-up").count, here.space
     space = SearchSpace(box.parameters, box.mechanics, box.constraints)
     unit = np.concatenate([space.latin_hypercube(count, seed_of(seed, k)) for k in range(_SPARE)])
     renderings = [Rendering.of(space, row) for row in np.asarray(space.to_physical(unit))]
@@ -71,8 +71,8 @@ def header_for(
     if warm:
         block, sets = warm_up(study, seed, materials[0])
         blocks.append(block)
-    rest = protocol(study.session, "optimisation").rest
     for i, name in enumerate(materials):
+        rest = protocol(study_of(study, name).session, "optimisation").rest
         blocks.append(Block("optimisation", study.selection.trials, material=name, rest=rest if i else 0.0))
     return header_of(study, participant, session, seed, blocks, sets, **others)
 

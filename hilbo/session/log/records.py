@@ -11,6 +11,7 @@ import msgspec
 
 from hilbo.errors import InputError
 from hilbo.study.file.plan_file import Block
+from hilbo.study.formats.json_file import Content
 
 __all__ = ["PAUSE", "SCHEMA", "Event", "Header", "Need", "Pause", "RefusedError", "Status", "Trial", "WarmUp"]
 
@@ -43,6 +44,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
 class Header(msgspec.Struct, frozen=True, kw_only=True):
     """The first line of a log: all that is fixed before a session begins.
 
+    `study`: hash of the study file; `study_tables`: its content, which is stored when the log is created.
     `unblinded`: what showed the participant the parameters, "try" for `hilbo try`; "" if nothing did. `shown_to`: roles
     to which the parameters of the stimuli were shown, where a stimulus program presents them.
     """
@@ -63,6 +65,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     language: str = "en"
     unblinded: str = ""
     shown_to: tuple[str, ...] = ()
+    study_tables: Content = {}
 
 
 class Need(msgspec.Struct, frozen=True):

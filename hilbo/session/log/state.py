@@ -19,9 +19,9 @@ from operator import itemgetter
 from typing import Any, Literal
 
 from hilbo.errors import InputError
+from hilbo.session.log.header_check import protocol_of
 from hilbo.session.log.records import PAUSE, Event, Header, Need, Pause, RefusedError, Trial, WarmUp
 from hilbo.session.log.transitions import APPLY, STOPS, stop_key
-from hilbo.study.file.protocols import protocol
 from hilbo.study.file.reading import StudyFile
 
 __all__ = ["LiveSession", "Screen"]
@@ -221,7 +221,7 @@ class LiveSession:
 
     def steps_of(self, trial: Trial) -> list[tuple[str, float]]:
         """Steps of a trial: (what is shown, duration in s); a and b are swapped if b is presented first."""
-        steps = protocol(self.study.session, self.header.blocks[trial.block].phase).steps
+        steps = protocol_of(self.study, self.header.blocks[trial.block]).steps
         other = {"a": "b", "b": "a"} if trial.first == "b" else {}
         return [(other.get(step.show, step.show), step.seconds) for step in steps]
 

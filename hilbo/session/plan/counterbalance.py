@@ -1,4 +1,5 @@
-"""Counterbalanced orders: Williams designs for materials, balanced pairs for comparisons; all from a seed.
+"""Counterbalanced orders: Williams designs for materials, balanced pairs for comparisons, and random assignment of
+participants to materials; all from a seed.
 
 A *Williams design* of n treatments is a set of orders in which every treatment is at every position equally often, and
 follows every other equally often: n orders for even n, a Latin square of n and its mirror image, 2n, for odd n (E. J.
@@ -16,13 +17,14 @@ and neighbours balance carry-over effects from one treatment to the next only, n
 """
 
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Int
 
-__all__ = ["Comparison", "Side", "block_size", "comparisons", "orders", "williams"]
+__all__ = ["Comparison", "Side", "assigned", "block_size", "comparisons", "orders", "williams"]
 
 Side = Literal["a", "b"]
 Comparison = tuple[str, str, Side]
@@ -54,6 +56,19 @@ def orders(n: int, participants: int, seed: int) -> Int[np.ndarray, "participant
         for half in rng.permutation(len(halves)):
             rows += [names[halves[half][row]] for row in rng.permutation(n)]
     return np.array(rows[:participants], int).reshape(participants, n)
+
+
+def assigned(people: Mapping[str, int], seed: int) -> list[str]:
+    """Random assignment of participants, in their order, to groups (name -> number of participants), in permuted
+    blocks; the same for the same seed.
+
+    A block has the smallest numbers in the ratio of the groups, in random order: for 24, 8 and 8 people, three of the
+    first group and one of each other. So groups grow in this ratio, also if recruitment ends early.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence([seed, len(people), 4]))
+    blocks = math.gcd(*people.values())
+    block = [name for name, count in people.items() for _ in range(count // blocks)]
+    return [block[i] for _ in range(blocks) for i in rng.permutation(len(block))]
 
 
 def comparisons(pairs: Sequence[tuple[str, str]], repeats: int, seed: int) -> list[Comparison]:

@@ -4,7 +4,7 @@ The map is fitted again from the answers, so that best, mid and worst are read f
 that of result.json, or the results are of other answers or another study, and are refused.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +15,7 @@ from hilbo.errors import InputError
 from hilbo.search.candidates import search_points
 from hilbo.search.rendering import Rendering
 from hilbo.session.plan.plan import Source
-from hilbo.study.analysis.tolerance import best_mid_worst
+from hilbo.study.analysis.best_mid_worst import Sets, best_mid_worst, second_choice_sentence
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import aggregate_cohort
@@ -30,10 +30,10 @@ _NAMES = ("best", "mid", "worst")
 NamedSets = dict[str, dict[str, float]]
 
 
-def check_participants(result: Result, participants: Sequence[str], source: Source) -> None:
-    """Raise InputError for a participant whose answers are in the results although `source` is "aggregate", or are not
-    although it is "individual"."""
-    in_map = {person.participant for person in result.participants}
+def check_participants(results: Iterable[Result], participants: Sequence[str], source: Source) -> None:
+    """Raise InputError for a participant whose answers are in one of the materials' results although `source` is
+    "aggregate", or in none of them although it is "individual"."""
+    in_map = {person.participant for result in results for person in result.participants}
     for person in participants:
         if source == "aggregate" and person in in_map:
             raise InputError(
@@ -46,30 +46,35 @@ def check_participants(result: Result, participants: Sequence[str], source: Sour
 
 
 def validation_sets(
-    study: Study, result: Result, cohort: Cohort, source: Source, participants: Sequence[str]
+    study: Study,
+    result: Result,
+    cohort: Cohort,
+    source: Source,
+    participants: Sequence[str],
+    note: Callable[[str], None] = lambda sentence: None,
 ) -> NamedSets:
     """Compute the sets best, mid and worst of the population's map, or of each participant's own: name -> parameters.
 
-    Names are "best" or, with source "individual", "PARTICIPANT best". The maps are fitted from the answers in `cohort`
-    of the participants in the results. Raises InputError for another aggregation method or optimum than in the results.
+    Names are "best" or, with source "individual", "PARTICIPANT best", for those of the `participants` who are in the
+    results. The maps are fitted from the answers in `cohort` of the participants in the results. `note` is called with
+    a sentence for each set that is a second choice. Raises InputError for another aggregation method or optimum than in
+    the results.
     """
     cohort = cohort.of([person.participant for person in result.participants])
-    if result.rule not in (None, study.rule):
-        raise InputError(
-            f'plan: result.json is by the rule "{result.rule}", and the study\'s is "{study.rule}"; aggregate again'
-            " without --rule, or write that rule into the study file."
-        )
+    _check_rule(study, result)
     study = resolved(study, cohort)
     aggregated = aggregate_cohort(study, cohort, result.seed, alternatives=False)
     _check_same(study, result, np.asarray(aggregated.optimum.x))
     points = search_points(study.space, result.seed)
     if source == "aggregate":
-        return _named(study, best_mid_worst(study, aggregated.surface, points, prior=aggregated.map.map_prior).x, "")
+        three = best_mid_worst(study, aggregated.surface, points, prior=aggregated.map.map_prior)
+        return _named(study, three, "", "the population", note)
     sets: NamedSets = {}
-    for person in participants:
+    for person in (name for name in participants if name in cohort.names):
         row = cohort.names.index(person)
         posterior = jax.tree.map(lambda leaf, row=row: leaf[row], aggregated.posteriors)
-        sets |= _named(study, best_mid_worst(study, _Predict(posterior), points).x, f"{person} ")
+        three = best_mid_worst(study, _Predict(posterior), points)
+        sets |= _named(study, three, f"{person} ", person, note)
     return sets
 
 
@@ -94,6 +99,7 @@ def aggregate_best_sets(study: Study, result: Result) -> NamedSets:
         """Parameters of an optimum, checked against the study's ranges; `what` names it in messages."""
         return check_values(optimum.parameters, study.space.parameters, "plan", what)
 
+    _check_rule(study, result)
     sets = {"aggregate": of(result.optimum, "the optimum")}
     for person in result.participants:
         if person.optimum is None:
@@ -102,10 +108,22 @@ def aggregate_best_sets(study: Study, result: Result) -> NamedSets:
     return sets
 
 
-def _named(study, unit, prefix) -> NamedSets:
-    """Sets from three points of the unit cube, best, mid, worst: `prefix` and role -> parameters in physical units."""
-    rows = np.asarray(study.space.to_physical(unit))
+def _named(study: Study, three: Sets, prefix: str, whose: str, note: Callable[[str], None]) -> NamedSets:
+    """Three sets as a dict: `prefix` and role -> parameters in physical units. `note`: told of those of `whose` map
+    that are a second choice."""
+    for name in three.second_choice:
+        note(f"plan: {second_choice_sentence(study, name, whose)}")
+    rows = np.asarray(study.space.to_physical(three.x))
     return {prefix + name: Rendering.of(study.space, row).values for name, row in zip(_NAMES, rows, strict=True)}
+
+
+def _check_rule(study: Study, result: Result) -> None:
+    """Raise InputError if the results are by another aggregation method than the study's."""
+    if result.rule not in (None, study.rule):
+        raise InputError(
+            f'plan: result.json is by the rule "{result.rule}", and the study\'s is "{study.rule}"; aggregate again'
+            " without --rule, or write that rule into the study file."
+        )
 
 
 def _check_same(study, result, x):

@@ -18,13 +18,13 @@ from hilbo.population.maps import RuleMap, learnt_map, point_rule
 from hilbo.population.rules.registry import RECOMMENDED, RULES
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
+from hilbo.study.analysis.best_mid_worst import Sets, best_mid_worst, second_choice_sentence
 from hilbo.study.analysis.cohort_results import CohortResults, Say, analyse_cohort
 from hilbo.study.analysis.heterogeneity import how_aggregated
 from hilbo.study.analysis.optimised import FixedAndOptimised, fixed_and_optimised
 from hilbo.study.analysis.progress import Progress
 from hilbo.study.analysis.rule_comparison import FEWEST, compare
-from hilbo.study.analysis.tolerance import Sets, Tolerance, best_mid_worst, tolerance
-from hilbo.study.analysis.tolerance_intervals import Ends, tolerance_ends
+from hilbo.study.analysis.tolerance import Ends, Tolerance, tolerance, tolerance_ends
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort
@@ -201,12 +201,14 @@ def _reading(study: Study, aggregate: Any, seed: int) -> Reading:
 
 
 def _best_mid_worst(study: Study, aggregate: Aggregate, seed: int) -> tuple[Sets | None, tuple[str, ...]]:
-    """Best, mid and worst stimulus and (); or None and one sentence with the reason why there are none."""
+    """Best, mid and worst stimulus of the population map, and a sentence for each that is a second choice; or None and
+    the reason why there are none."""
+    candidates = search_points(study.space, seed)
     try:
-        candidates = search_points(study.space, seed)
-        return best_mid_worst(study, aggregate.surface, candidates, prior=aggregate.map.map_prior), ()
+        sets = best_mid_worst(study, aggregate.surface, candidates, prior=aggregate.map.map_prior)
     except InputError as error:
         return None, (f"No best, mid and worst sets: {str(error).removeprefix('best_mid_worst: ')}",)
+    return sets, tuple(second_choice_sentence(study, name) for name in sets.second_choice)
 
 
 def _aggregated_otherwise(map_: RuleMap) -> Iterator[str]:

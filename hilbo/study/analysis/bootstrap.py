@@ -10,9 +10,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from hilbo.likelihoods import Goal, OrdinalProbit
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.pointwise import aggregate
+from hilbo.study.config import Study
+from hilbo.study.estimate.optimum import score
 
 __all__ = ["can_resample", "resampled_tops"]
 
@@ -23,6 +26,7 @@ def can_resample(posteriors: Posterior) -> bool:
 
 
 def resampled_tops(
+    study: Study,
     posteriors: Posterior,
     points: Float[Array, "m d"],
     rule: str,
@@ -31,19 +35,23 @@ def resampled_tops(
     seed: int = 0,
     draws: int = 200,
 ) -> Int[np.ndarray, " draws"]:
-    """Bootstrap over participants: for each resample the row of `points` (unit cube) where its map is highest.
-    (draws,).
+    """Bootstrap over participants: for each resample the row of `points` (unit cube) where its map
+    is highest by `score`. (draws,).
 
     **Arguments:** `rule`: a method of `POINTWISE`; `share`: shared variance fraction of the hierarchical one, otherwise
     None; `prior`: variance of the map without responses, a scalar.
     """
     people = posteriors.trials.mask.shape[0]
     rows = np.random.default_rng(seed).integers(0, people, (draws, people))
-    return np.asarray(_tops(posteriors, points, jnp.asarray(rows), rule, share, jnp.asarray(prior)))
+    return np.asarray(
+        _tops(study.goal, study.gp.likelihood, posteriors, points, jnp.asarray(rows), rule, share, jnp.asarray(prior))
+    )
 
 
 @program
 def _tops(
+    goal: Goal,
+    likelihood: OrdinalProbit,
     posteriors: Posterior,
     points: Float[Array, "m d"],
     rows: Int[Array, "draws M"],
@@ -55,7 +63,10 @@ def _tops(
     compiled."""
     means, explained = jax.lax.map(lambda person: person.predict_explained(points), posteriors)
 
+    apart = 0.0 if share is None else (1.0 - share) * prior
+
     def one(chosen: Int[Array, " M"]) -> Int[Array, ""]:
-        return jnp.argmax(aggregate(rule, means[chosen], explained[chosen], prior, share=share)[0])
+        moments = aggregate(rule, means[chosen], explained[chosen], prior, share=share)
+        return jnp.argmax(score(goal, likelihood, *moments, apart))
 
     return jax.lax.map(one, rows)

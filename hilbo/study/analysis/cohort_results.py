@@ -39,7 +39,7 @@ class CohortResults(NamedTuple):
     check: Content | None
     """Results of the model check (`model_check`); None if not requested, or with fewer than three participants."""
     highest: HighestAnswer | None = None
-    """A new participant's probability of the highest response at the optimum; None by methods that do not
+    """A new participant's probability of the goal at the optimum; None by methods that do not
     predict it."""
 
     @property

@@ -42,9 +42,9 @@ def hills_of(
 ) -> tuple[Hill, ...]:
     """Hills in the order of falling probability, without those below 0.01.
 
-    `points` (m, d): even points in box coordinates; `height`, `sd` (m,): the map's mean and standard deviation there;
-    `weight` (m,): fraction of joint draws that are largest at each point; `kernel`: its length scales define the
-    distance of points.
+    `points` (m, d): even points in box coordinates; `height`, `sd` (m,): closeness of the map's mean to the goal, and
+    its standard deviation there; `weight` (m,): fraction of joint draws that are largest at each point; `kernel`: its
+    length scales define the distance of points.
     """
     tops = _tops(embedded(kernel, points), height, sd)
     hills = []

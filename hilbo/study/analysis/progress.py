@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hilbo.likelihoods import Goal, OrdinalProbit
 from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
@@ -27,7 +28,7 @@ from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, fit_cohort
-from hilbo.study.estimate.optimum import individual_optima, map_optimum
+from hilbo.study.estimate.optimum import individual_optima, map_optimum, score
 
 __all__ = ["Progress", "follow"]
 
@@ -107,7 +108,7 @@ def follow(study: Study, aggregated: Aggregate, seed: int = 0, counts: Sequence[
         map_ = _map_by_points(study, aggregated.map.share, posteriors)
         population = np.asarray(map_optimum(study, map_, candidates).x)
         optima = aggregated.individuals if last else individual_optima(study, posteriors, candidates)
-        halves = np.asarray(points)[_tops(map_, points, split)]
+        halves = np.asarray(points)[_tops(study, map_, points, split)]
         return population, np.asarray(optima.x), halves, map_ if last or count in _MOMENTS else None
 
     optima_after = [after(count) for count in asked[:1].tolist()]  # whose programs serve the others
@@ -131,24 +132,29 @@ def _splits(people: int, seed: int) -> Bool[np.ndarray, "s M"]:
     return order < people // 2
 
 
-def _tops(map_: RuleMap, points: Float[Array, "m d"], split: Bool[np.ndarray, "s M"]) -> Int[np.ndarray, "s 2"]:
+def _tops(
+    study: Study, map_: RuleMap, points: Float[Array, "m d"], split: Bool[np.ndarray, "s M"]
+) -> Int[np.ndarray, "s 2"]:
     """Row of the point where the map of each half is highest, (s, 2), the first half first."""
     if not len(split):
         return np.zeros((0, 2), int)
     sides = np.stack([split, ~split], axis=1).reshape(-1, split.shape[1])
-    return np.asarray(_highest(map_, points, to_device(sides))).reshape(-1, 2)
+    return np.asarray(_highest(study.goal, study.gp.likelihood, map_, points, to_device(sides))).reshape(-1, 2)
 
 
 @program
-def _highest(map_: RuleMap, points: Float[Array, "m d"], sides: Bool[Array, "k M"]) -> Int[Array, " k"]:
-    """Row of the point where the map of each subset of participants is highest. `sides` (k, M): membership."""
+def _highest(
+    goal: Goal, likelihood: OrdinalProbit, map_: RuleMap, points: Float[Array, "m d"], sides: Bool[Array, "k M"]
+) -> Int[Array, " k"]:
+    """Row of the point where the map of each subset of participants is highest by `score`. `sides` (k, M):
+    membership."""
     means, explained = jax.lax.map(lambda person: person.predict_explained(points), map_.experts)
 
     share = map_.share if RULES[map_.rule].learns_share else None
 
     def one(chosen: Bool[Array, " M"]) -> Int[Array, ""]:
-        mean, _ = aggregate(map_.rule, means, explained, map_.prior, share=share, mask=chosen)
-        return jnp.argmax(mean)
+        moments = aggregate(map_.rule, means, explained, map_.prior, share=share, mask=chosen)
+        return jnp.argmax(score(goal, likelihood, *moments, map_.apart))
 
     return jax.lax.map(one, sides)
 

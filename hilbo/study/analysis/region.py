@@ -74,7 +74,7 @@ def optimum_region(
     if map_.shared is None:
         return None
     functions = [each.function for each in drawn] or [map_.shared]
-    places = best_places(study.space, functions, seed, count, _DRAWS)
+    places = best_places(study.space, study.goal, functions, seed, count, _DRAWS)
     first, which = _distinct(np.asarray(places.points))
     points, weight = np.asarray(places.points)[first], np.bincount(which, np.asarray(places.share))
     mean, variance = (np.asarray(each)[first] for each in predict_map(map_, places.points))
@@ -82,8 +82,16 @@ def optimum_region(
     held = int(np.searchsorted(np.cumsum(weight[order]), PROBABILITY)) + 1
     inside = np.zeros(len(weight), bool)
     inside[order[:held]] = True
-    hills = hills_of(
-        np.asarray(study.space.to_box(jnp.asarray(points))), mean, np.sqrt(variance), weight, study.gp.kernel
+    hills = (
+        ()
+        if not study.one_optimum
+        else hills_of(
+            np.asarray(study.space.to_box(jnp.asarray(points))),
+            np.asarray(study.goal.closeness(study.gp.likelihood, jnp.asarray(mean))),
+            np.sqrt(variance),
+            weight,
+            study.gp.kernel,
+        )
     )
     return Region(points[inside], points[~inside], float(inside[first < count].mean()), hills)
 
@@ -128,12 +136,17 @@ def _extent(parameter: Parameter, values: Float[np.ndarray, " k"]) -> list[float
     return [values.min().item(), values.max().item()]
 
 
-def region_sentences(region: Region | None) -> list[str]:
+def region_sentences(region: Region | None, one_optimum: bool = True) -> list[str]:
     """Warnings: the optimum is not located (region above a quarter of the space), and it may be at another mode
-    (probability above 0.2). Empty for no region."""
+    (probability above 0.2). Empty for no region. `one_optimum`: of the study."""
     if region is None:
         return []
     sentences = []
+    if not one_optimum:
+        return [
+            "The goal is between other answers, so that many renderings are equally good: with"
+            f" {PROBABILITY:.0%} a best one lies in a region that takes up {region.volume:.0%} of what may be rendered."
+        ]
     if not region.located:
         sentences.append(
             f"The best rendering is not located: with {PROBABILITY:.0%} it lies in a region that takes up"

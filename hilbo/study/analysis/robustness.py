@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from hilbo.errors import InputError
 from hilbo.hyperparameters.maximum_evidence import optimum_sensitivity
+from hilbo.likelihoods import Goal
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.population.maps import point_rule
@@ -32,7 +33,7 @@ from hilbo.study.analysis.optimised import LEARNABLE, FixedAndOptimised, differe
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort
-from hilbo.study.estimate.optimum import Optimum, map_optimum, population_optimum, predict_people
+from hilbo.study.estimate.optimum import Optimum, map_optimum, population_optimum, predict_people, score
 
 __all__ = ["LIMIT", "NEAR", "Place", "Resampled", "Robustness", "robustness"]
 
@@ -44,7 +45,7 @@ NEAR = 0.1
 
 
 class Place(NamedTuple):
-    """An optimum, and the responses given within `NEAR` of it: their number, and how many were the highest."""
+    """An optimum, and the responses given within `NEAR` of it: their number, and how many were the goal."""
 
     optimum: Optimum
     answers: int
@@ -68,8 +69,8 @@ class Robustness(NamedTuple):
     one uphill of the fixed optimum (None for a method that learns, whose optimum is no maximum of the mean), and the
     fixed optimum. `nrmse`, `local_nrmse`: of the optimised and of the local
     optimum to the fixed one; `individual_nrmse` (M,); `resampled`: None with fewer than two participants;
-    `sensitivity`: d(fixed optimum, unit cube) / d(log theta, log noise, first threshold, log gaps), None for a method
-    that learns them.
+    `sensitivity`: d(fixed optimum, unit cube) / d(log theta, log noise, first threshold in prior standard deviations,
+    log gaps), None for a method that learns them.
     """
 
     hyperparameters: FixedAndOptimised
@@ -105,7 +106,7 @@ def robustness(study: Study, cohort: Cohort, seed: int = 0, *, learn: Sequence[s
     optimised = aggregate_cohort(both.optimised, cohort, seed, alternatives=False)
     levels, best = study.gp.kernel.levels, fixed.optimum.x
     local = None if learns else map_optimum(both.optimised, optimised.map, best[None, :])
-    place = partial(_place, cohort=cohort, levels=levels)
+    place = partial(_place, goal=study.goal, cohort=cohort, levels=levels)
     return Robustness(
         hyperparameters=both,
         fixed_aggregate=fixed,
@@ -118,7 +119,7 @@ def robustness(study: Study, cohort: Cohort, seed: int = 0, *, learn: Sequence[s
         local_nrmse=None if local is None else float(nrmse(local.x, best, levels)),
         individual_nrmse=np.asarray(nrmse(optimised.individuals.x, fixed.individuals.x, levels)),
         resampled=_resampled((both.fixed, fixed), (both.optimised, optimised), seed),
-        sensitivity=None if learns else _sensitivity_of(study, fixed, tuple(learn), seed),
+        sensitivity=None if learns or not study.one_optimum else _sensitivity_of(study, fixed, tuple(learn), seed),
     )
 
 
@@ -138,12 +139,12 @@ def _at(study: Study, aggregate: Aggregate, x: Float[Array, " d"]) -> Optimum:
     return Optimum(x, mean[0], jnp.sqrt(variance[0]), aggregate.class_probabilities(study.gp.likelihood, x[None, :])[0])
 
 
-def _place(optimum: Optimum, cohort: Cohort, levels: tuple[int, ...]) -> Place:
+def _place(optimum: Optimum, goal: Goal, cohort: Cohort, levels: tuple[int, ...]) -> Place:
     """An optimum with the number of responses near it."""
     mask = np.asarray(cohort.trials.mask)
     away = np.asarray(nrmse(np.asarray(cohort.trials.x), np.asarray(optimum.x), levels))
     answers = np.asarray(cohort.trials.q)[mask & (away <= NEAR)]
-    return Place(optimum, len(answers), int(np.sum(answers == optimum.class_probabilities.size - 1)))
+    return Place(optimum, len(answers), int(np.sum(answers == goal.category)))
 
 
 def _resampled(fixed: tuple[Study, Aggregate], optimised: tuple[Study, Aggregate], seed: int) -> Resampled | None:
@@ -165,8 +166,10 @@ def _tops(
     """
     points = jnp.concatenate([aggregate.optimum.x[None, :], candidates])
     rule, share = point_rule(study.rule, aggregate.map.share)
-    whole = int(jnp.argmax(predict_people(aggregate.posteriors, points, rule, share)[0]))
-    tops = resampled_tops(aggregate.posteriors, points, rule, share, study.gp.kernel.variance, seed)
+    apart = 0.0 if share is None else (1.0 - share) * study.gp.kernel.variance
+    moments = predict_people(aggregate.posteriors, points, rule, share)
+    whole = int(jnp.argmax(score(study.goal, study.gp.likelihood, *moments, apart)))
+    tops = resampled_tops(study, aggregate.posteriors, points, rule, share, study.gp.kernel.variance, seed)
     return np.asarray(points)[whole], np.asarray(points)[tops]
 
 
@@ -197,7 +200,10 @@ def _sensitivity(
         return jax.vmap(lambda t: fit(gp, t, inference=differentiable(study.inference), throw=False))(trials)
 
     def height(w, posteriors: Posterior):
-        return predict_people(posteriors, study.space.from_box(w)[None, :], rule, share)[0][0]
+        gp = jax.tree.map(lambda leaf: leaf[0], posteriors.gp)
+        moments = predict_people(posteriors, study.space.from_box(w)[None, :], rule, share)
+        apart = 0.0 if share is None else (1.0 - share) * gp.kernel.variance
+        return score(study.goal, gp.likelihood, *moments, apart)[0]
 
     box, searched = study.space.to_box(x), study.space.searched
     between = {name: searched.get(name) for name in ("walls", "held")}

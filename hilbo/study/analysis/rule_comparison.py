@@ -11,6 +11,7 @@ deviation. And, once, the differences between participants, with a recommendatio
 import dataclasses
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -183,14 +184,14 @@ def _agreement(mean: Float[Array, " p"], other: Float[Array, " p"]) -> float:
 
 def _by_draws(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[float]] | None:
     """5, 50 and 95 % quantiles of the maximum of joint draws of the map; None if the map has no joint posterior."""
-    x = ground.x
+    x, closeness = ground.x, partial(study.goal.closeness, study.gp.likelihood)
     if map_.method == "exact" and map_.shared is not None:
         joint = posterior_map(map_.shared, x)
     elif RULES[map_.rule].product:
         joint = joint_map(ground.posteriors, x)
     else:
         return None
-    return _quantiles(study, x, np.asarray(joint.optima(jax.random.key(ground.seed), _DRAWS)))
+    return _quantiles(study, x, np.asarray(joint.optima(jax.random.key(ground.seed), _DRAWS, closeness=closeness)))
 
 
 def _by_bootstrap(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[float]] | None:
@@ -200,7 +201,7 @@ def _by_bootstrap(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, lis
         return None
     share = map_.share if RULES[map_.rule].learns_share else None
     x = ground.x
-    tops = resampled_tops(ground.posteriors, x, map_.rule, share, map_.prior, ground.seed, _DRAWS // 4)
+    tops = resampled_tops(study, ground.posteriors, x, map_.rule, share, map_.prior, ground.seed, _DRAWS // 4)
     return _quantiles(study, x, np.bincount(tops, minlength=x.shape[0]) / len(tops))
 
 

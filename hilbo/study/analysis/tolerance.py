@@ -1,19 +1,22 @@
-"""Reading a population map: best, mid and worst stimuli, and the tolerance interval of each parameter.
+"""Tolerance interval of each parameter of a population map.
 
-A map is any function `predict(x) -> mean, variance` of the latent score at points (m, d) of the unit cube. *Best* is
-the feasible maximum of the mean. *Worst* is the deepest local minimum of the mean in the feasible set at which the map
-is informed by responses: sd <= `known` times that without responses. *Mid* is the candidate whose mean is nearest to
-the middle of the two, among those at least `apart` from both, and equally known. All three follow from the map alone
-(paper, section VI-C).
+A map is any function `predict(x) -> mean, variance` of the latent score at points (m, d) of the unit cube.
 
-The *tolerance interval* of a parameter is the connected feasible interval through the optimum on which the highest
-response is the most probable one under `predict`, a new participant's function (paper, section VII-C). Along any
+The *tolerance interval* of a parameter is the connected feasible interval through the optimum on which the goal
+is the most probable response under `predict`, a new participant's function (paper, section VII-C). Along any
 parameter but K1 the slice stays passive: K1 is kept where it is passive, and reduced to the passive boundary where it
 is not; along K1 the interval ends, one-sided, where the boundary cuts it. Each end has a reason: another response, the
 range, or the limit that the next value violates: a constraint of the study, the passive boundary, or the range of
 effective damping.
+
+`tolerance_ends` gives the uncertainty of both ends: participants are resampled, the map is aggregated again from the
+same posteriors, and the interval through the same optimum is read off a coarse grid; percentiles over these draws
+describe the variation due to the choice of participants. A draw in which the goal is not the most probable response at
+the optimum has no interval, and is counted. Nothing is refitted. With one participant all draws are the same, so that
+the percentiles are not known.
 """
 
+import math
 from collections.abc import Callable
 from typing import Literal
 
@@ -22,35 +25,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from hilbo import acquisition
-from hilbo.errors import InputError
-from hilbo.numerics.climbing import Choice
 from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import Posterior
 from hilbo.population.newcomer import class_probabilities
+from hilbo.population.pointwise import aggregate
 from hilbo.population.shared.scale_use import ScaleUse
-from hilbo.search.apart import differences
 from hilbo.search.space import Bound
+from hilbo.study.analysis.bootstrap import can_resample
 from hilbo.study.config import Study
 
-__all__ = ["End", "Predict", "Sets", "Tolerance", "best_mid_worst", "dominant", "slice_through", "tolerance"]
+__all__ = ["End", "Ends", "Predict", "Tolerance", "dominant", "slice_through", "tolerance", "tolerance_ends"]
 
 Predict = Callable[[Float[Array, "m d"]], tuple[Float[Array, " m"], Float[Array, " m"]]]
 End = Literal["other answer", "range"] | Bound
 
-_STARTS = 24  # minima that are looked into,
-_SEPARATE = 0.1  # from starts so far apart
 _GRID = 1025  # points of a slice; its ends are then found by bisection
 _HALVINGS = 40
-
-
-class Sets(eqx.Module):
-    """Best, mid and worst stimulus: points (3, d) of the unit cube, and mean and sd of the map there."""
-
-    x: Float[Array, "3 d"]
-    mean: Float[Array, "3"]
-    sd: Float[Array, "3"]
+_COARSE, _DRAWS = 257, 200  # points of a slice, and draws, of the bootstrap
 
 
 class Tolerance(eqx.Module):
@@ -63,56 +56,10 @@ class Tolerance(eqx.Module):
     high_end: End = eqx.field(static=True)
 
 
-def best_mid_worst(
-    study: Study,
-    predict: Predict,
-    candidates: Float[Array, "m d"],
-    *,
-    known: float = 0.8,
-    apart: float = 0.2,
-    prior: ArrayLike | None = None,
-) -> Sets:
-    """Best, mid and worst stimulus of a validation session, as the module defines them. Deterministic.
-
-    **Arguments:** `candidates`: feasible points (`search_points`); `known`: largest sd of worst and mid, in units of
-    the prior's; `apart`: smallest distance of mid from both, in the unit cube; `prior`: the map's variance without
-    responses (`RuleMap.map_prior`), a scalar or (m,), by default one participant's. Raises InputError if no minimum is
-    known well enough, or no candidate qualifies as mid.
-    """
-    candidates = jnp.asarray(candidates)
-    mean, sd = _mean_and_sd(predict, candidates)
-    limit = known * jnp.sqrt(study.gp.kernel.diagonal(candidates[0]) if prior is None else prior)
-    best = _highest(study, predict, candidates, mean)
-    minima = _minima(study, predict, candidates, jnp.where(sd <= limit, mean, jnp.inf))
-    depth, doubt = _mean_and_sd(predict, minima)
-    usable = np.asarray((doubt <= limit) & study.space.feasible(minima))
-    if not usable.any():
-        raise InputError(
-            f"best_mid_worst: the map has no minimum with an sd below {known:g} of the prior's; more answers are"
-            " needed, or a larger `known`."
-        )
-    worst = minima[int(np.argmin(np.where(usable, depth, np.inf)))]
-    ends = jnp.stack([best, worst])
-    middle = jnp.mean(_mean_and_sd(predict, ends)[0])
-    far = (
-        jnp.min(jnp.linalg.norm(differences(study.gp.kernel.levels, candidates[:, None], ends[None]), axis=-1), axis=1)
-        >= apart
-    )
-    fits = np.asarray(far & (sd <= limit))
-    if not fits.any():
-        raise InputError(
-            f"best_mid_worst: no point is {apart:g} of the ranges away from both best and worst and known well enough;"
-            " use a smaller `apart` or a larger `known`."
-        )
-    mid = candidates[int(np.argmin(np.where(fits, np.abs(np.asarray(mean - middle)), np.inf)))]
-    x = jnp.stack([best, mid, worst])
-    return Sets(x, *_mean_and_sd(predict, x))
-
-
 def dominant(
     study: Study, predict: Predict, x: Float[Array, "m d"], scale: ScaleUse | None = None
 ) -> Bool[Array, " m"]:
-    """Whether the highest response is the most probable one at points (m, d) (paper, section VII-C). `scale`: how
+    """Whether the goal is the most probable response at points (m, d) (paper, section VII-C). `scale`: how
     participants differ in the use of the scale."""
     return _lead(study, predict, x, scale) > 0
 
@@ -135,8 +82,8 @@ def slice_through(
 def tolerance(
     study: Study, predict: Predict, x: Float[Array, " d"], parameter: str, scale: ScaleUse | None = None
 ) -> Tolerance | None:
-    """Tolerance interval of a parameter through the optimum `x` (d,); None if the highest response is not the most
-    probable one there. `scale`: how participants differ in the use of the scale."""
+    """Tolerance interval of a parameter through the optimum `x` (d,); None if the goal is not the most probable
+    response there. `scale`: how participants differ in the use of the scale."""
     index = study.space.names.index(parameter)
     here, searched = float(x[index]), study.space.parameters[index]
     grid = searched.axis(_GRID) if searched.discrete else np.unique(np.append(np.linspace(0.0, 1.0, _GRID), here))
@@ -176,8 +123,8 @@ def _tolerated(
     values: Float[Array, " m"],
     scale: ScaleUse | None,
 ) -> Bool[np.ndarray, " m"]:
-    """Mask of the parameter values (unit scale) at which the slice is feasible and the highest response is the most
-    probable."""
+    """Mask of the parameter values (unit scale) at which the slice is feasible and the goal is the most probable
+    response."""
     points, feasible = slice_through(study, x, parameter, values)
     return np.asarray(feasible & dominant(study, predict, points, scale))
 
@@ -204,68 +151,104 @@ def _bisect(
 
 @program
 def _lead(study: Study, predict: Predict, x: Float[Array, "m d"], scale: ScaleUse | None) -> Float[Array, " m"]:
-    """Probability of the highest response minus that of the most probable other one. (m,)."""
+    """Probability of the goal minus that of the most probable other one. (m,)."""
     p = class_probabilities(study.gp.likelihood, *predict(x), scale)
-    return p[:, -1] - jnp.max(p[:, :-1], axis=1)
+    goal = study.goal.category
+    return p[:, goal] - jnp.max(jnp.delete(p, goal, axis=1), axis=1)
 
 
-@program
-def _mean_and_sd(predict: Predict, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Mean and standard deviation of the map at the points."""
-    mean, variance = predict(x)
-    return mean, jnp.sqrt(variance)
+class Ends(eqx.Module):
+    """95 % percentile intervals of both ends of a tolerance interval, in the parameter's unit; NaN: not known."""
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+    lost: float
+    """Fraction of draws in which the goal is not the most probable response at the optimum."""
 
 
-@program
-def _highest(
-    study: Study, predict: Predict, candidates: Float[Array, "m d"], mean: Float[Array, " m"]
-) -> Float[Array, " d"]:
-    """Feasible maximum of the map's mean, searched from the three highest candidates."""
-    return _maximum(study, lambda x: predict(x[None, :])[0][0], candidates, mean, starts=3).x
-
-
-def _minima(
-    study: Study, predict: Predict, candidates: Float[Array, "m d"], depth: Float[Array, " m"]
-) -> Float[Array, "s d"]:
-    """Local minima (s, d) of the mean, searched downhill from up to 24 separate candidates of small `depth`, inf
-    excluding a candidate. Some may repeat; none if all are excluded."""
-    points, left = np.asarray(candidates), np.asarray(depth).copy()
-    rows = []
-    while len(rows) < _STARTS and np.isfinite(left).any():
-        rows.append(int(left.argmin()))
-        away = differences(study.gp.kernel.levels, points, points[rows[-1]])
-        left[np.linalg.norm(away, axis=1) < _SEPARATE] = np.inf
-    if not rows:
-        return candidates[:0]
-    padded = rows + [rows[0]] * (_STARTS - len(rows))  # one shape, one compilation
-    return _downhill(study, predict, candidates[np.array(padded)])
-
-
-@program
-def _downhill(study: Study, predict: Predict, starts: Float[Array, "s d"]) -> Float[Array, "s d"]:
-    """The local minimum of the mean below each start, (s, d)."""
-
-    def one(x):
-        return _maximum(study, lambda x: -predict(x[None, :])[0][0], x[None, :], jnp.zeros(1, x.dtype), 1).x
-
-    return jax.lax.map(one, starts)
-
-
-def _maximum(
+def tolerance_ends(
     study: Study,
-    height: Callable[[Float[Array, " d"]], Float[Array, ""]],
-    candidates: Float[Array, "m d"],
-    values: Float[Array, " m"],
-    starts: int,
-) -> Choice:
-    """Feasible maximum of `height`, a function of one point, searched from the `starts` candidates with the largest
-    `values`."""
-    space = study.space
-    return acquisition.maximise(
-        values,
-        candidates,
-        height,
-        **space.searched,
-        starts=starts,
-        steps=300,
+    posteriors: Posterior,
+    x: Float[Array, " d"],
+    parameter: str,
+    seed: int = 0,
+    *,
+    rule: str = "bcm",
+    share: ArrayLike | None = None,
+    scale: ScaleUse | None = None,
+    draws: int = _DRAWS,
+) -> Ends | None:
+    """Bootstrap over participants of the tolerance interval of a parameter through `x` (d,); None if no draw has an
+    interval. With fewer than two participants with responses every number is NaN.
+
+    `rule`: aggregation method that works point by point; `share`: shared variance fraction of the hierarchical one,
+    otherwise None; `scale`: how participants differ in the use of the scale.
+    """
+    if not can_resample(posteriors):
+        return Ends((math.nan, math.nan), (math.nan, math.nan), math.nan)
+    index = study.space.names.index(parameter)
+    grid = study.space.parameters[index].axis(_COARSE)
+    if not study.space.parameters[index].discrete:
+        grid = np.unique(np.append(grid, float(x[index])))
+        grid = np.interp(
+            np.linspace(0, 1, _COARSE + 1), np.linspace(0, 1, len(grid)), grid
+        )  # one shape, one compilation
+    middle = int(np.argmin(np.abs(grid - float(x[index]))))
+    points, feasible = slice_through(study, x, parameter, jnp.asarray(grid, x.dtype))
+    means, explained, prior = _predictions(posteriors, points)
+    count = means.shape[0]
+    rows = jax.random.randint(jax.random.key(seed), (draws, count), 0, count)
+    inside = np.asarray(_dominant_in_draws(study, means, explained, prior, rows, rule, share, scale)) & np.asarray(
+        feasible
     )
+    ends = [_ends(row, middle) for row in inside if row[middle]]
+    if not ends:
+        return None
+    physical = np.asarray(study.space.parameters[index].to_physical(jnp.asarray(grid)))
+    low, high = (np.percentile(physical[list(side)], [2.5, 97.5]) for side in zip(*ends, strict=True))
+    lost = 1 - len(ends) / draws
+    return Ends((float(low[0]), float(low[1])), (float(high[0]), float(high[1])), lost)
+
+
+@program
+def _predictions(
+    posteriors: Posterior, x: Float[Array, "m d"]
+) -> tuple[Float[Array, "M m"], Float[Array, "M m"], Float[Array, " m"]]:
+    """Posterior mean and variance reduction (prior - posterior) of each participant, (M, m), and prior variance (m,),
+    at points."""
+    means, explained = jax.lax.map(lambda p: p.predict_explained(x), posteriors)
+    kernel = jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel
+    return means, explained, jax.vmap(kernel.diagonal)(x)
+
+
+@program
+def _dominant_in_draws(
+    study: Study,
+    means: Float[Array, "M m"],
+    explained: Float[Array, "M m"],
+    prior: Float[Array, " m"],
+    rows: Int[Array, "draws M"],
+    rule: str,
+    share: ArrayLike | None,
+    scale: ScaleUse | None = None,
+) -> Bool[Array, "draws m"]:
+    """Whether the goal is the most probable response of a new participant, (draws, m); `rows`: participants of
+    each resample."""
+
+    goal = study.goal.category
+
+    def one(chosen):
+        mean, variance = aggregate(rule, means[chosen], explained[chosen], prior, share=share)
+        apart = jnp.zeros_like(prior) if share is None else (1.0 - share) * prior  # a new person about the map
+        p = class_probabilities(study.gp.likelihood, mean, variance + apart, scale)
+        return p[:, goal] > jnp.max(jnp.delete(p, goal, axis=1), axis=1)
+
+    return jax.lax.map(one, rows)
+
+
+def _ends(inside: Bool[np.ndarray, " m"], middle: int) -> tuple[int, int]:
+    """First and last index of the run of True values through `middle`."""
+    outside = np.flatnonzero(~inside)
+    below, above = outside[outside < middle], outside[outside > middle]
+    first = int(below[-1]) + 1 if len(below) else 0
+    return first, int(above[0]) - 1 if len(above) else len(inside) - 1

@@ -68,8 +68,14 @@ def remove_unfinished(folder: Path) -> None:
     deleted stay, without an error."""
     for path in folder.glob(UNFINISHED):
         with contextlib.suppress(OSError):  # its writer was done just now, or is another user
-            if (file := held(path, 0)) is not None:
+            if (file := held(path, 0)) is None:
+                continue
+            try:
+                if os.name != "nt":  # deleted while locked: its writer may have just created it, and would lose it
+                    path.unlink()
+            finally:
                 os.close(file)
+            if os.name == "nt":  # which deletes no open file, and so none that a writer has just created
                 path.unlink()
 
 

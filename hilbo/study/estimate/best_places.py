@@ -1,4 +1,4 @@
-"""Posterior distribution of the optimum: the points at which joint draws of a map are largest.
+"""Posterior distribution of the optimum: the points at which joint draws of a map are closest to the goal.
 
 The points are spread evenly over the feasible set, its walls included. The fraction of draws that are largest at a
 point is the posterior probability that this point is the best of them; with posteriors under several draws of the
@@ -7,6 +7,7 @@ hyperparameters, these are integrated out.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from hilbo.kernels import RBF, Stationary
+from hilbo.likelihoods import Goal
 from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
@@ -41,7 +43,12 @@ class BestPlaces(NamedTuple):
 
 
 def best_places(
-    space: SearchSpace, functions: Sequence[Posterior], seed: int = 0, count: int = POINTS, draws: int = DRAWS
+    space: SearchSpace,
+    goal: Goal,
+    functions: Sequence[Posterior],
+    seed: int = 0,
+    count: int = POINTS,
+    draws: int = DRAWS,
 ) -> BestPlaces:
     """Distribution of the optimum over `count` even points of the feasible set and a quarter as many on its walls.
 
@@ -51,14 +58,17 @@ def best_places(
     points, each = search_points(space, seed, count), -(-draws // len(functions))
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
         seeds = map(to_device, range(seed, seed + len(functions)))
-        shares = list(pool.map(lambda function, seed: _shares(function, points, seed, each), functions, seeds))
+        shares = list(pool.map(lambda function, seed: _shares(function, goal, points, seed, each), functions, seeds))
     return BestPlaces(points, sum(shares[1:], shares[0]) / len(shares))
 
 
 @program
-def _shares(function: Posterior, points: Float[Array, "m d"], seed: ArrayLike, draws: int) -> Float[Array, " m"]:
-    """Fraction (m,) of `draws` joint draws of one posterior that are largest at each point."""
-    return posterior_map(function, points).optima(jax.random.key(seed), draws)
+def _shares(
+    function: Posterior, goal: Goal, points: Float[Array, "m d"], seed: ArrayLike, draws: int
+) -> Float[Array, " m"]:
+    """Fraction (m,) of `draws` joint draws of one posterior that are closest to the goal at each point."""
+    closeness = partial(goal.closeness, function.gp.likelihood)
+    return posterior_map(function, points).optima(jax.random.key(seed), draws, closeness=closeness)
 
 
 def nearness(

@@ -83,6 +83,8 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
 
     schema: Literal[1]
     study: str
+    meaning: tuple[str, ...]
+    """What responses to each of the `materials` mean (`StudyFile.meaning`)."""
     name: str
     seed: int
     phase: Phase

@@ -4,10 +4,10 @@ JAX.
 A study file is TOML (docs, "Study file"). Every mistake becomes one `InputError`:
 `file:line: key.path is …, it must be …`. The hash is the first 16 hex digits of the SHA-256 of the parsed content as
 JSON, in the order of the schemas, with defaults left out: writing a default explicitly does not change it, the order of
-the parameters does.
+the parameters does. A second hash covers the keys on which the meaning of responses depends
+(`hilbo.study.file.meaning`); logs and results are read together if it is the same.
 """
 
-import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping
@@ -21,17 +21,22 @@ import msgspec
 from hilbo.errors import InputError
 from hilbo.search.box import Box
 from hilbo.study.file.fields import enclosing, lines_of, prefix
+from hilbo.study.file.meaning import differing_keys, meaning_part
 from hilbo.study.file.protocols import SessionTable
-from hilbo.study.file.schema import GPTable, ReportTable, Selection
+from hilbo.study.file.schema import GPTable, PlanTable, ReportTable, Selection, Tables, ValidationTable
 from hilbo.study.file.simulated_people import SimulationTable
 from hilbo.study.file.space_tables import box_of, check_together, of_material, read
 from hilbo.study.file.stimuli import StimulusTable
 from hilbo.study.file.trial_flags import TrialFlag
+from hilbo.study.formats.json_file import Content, digest_of
 from hilbo.study.formats.parsing import check_parsed, toml
 
 __all__ = ["StudyFile", "checked", "read_study"]
 
 _T = TypeVar("_T")
+
+
+_NOT_HASHED = ("simulation", "random_effect", "validation")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +46,8 @@ class StudyFile:
     name: str
     responses: tuple[str, ...]
     """Labels, lowest first."""
+    goal: str
+    """The response that is searched for; empty for the highest."""
     attribute: str
     """Attribute that is rated, such as "perceived realism"; used in axis labels."""
     exclude: str
@@ -55,6 +62,8 @@ class StudyFile:
     selection: Selection
     session: SessionTable
     report: ReportTable
+    validation: ValidationTable
+    plan: PlanTable
     stimulus: StimulusTable | None
     """How a program or a person presents the stimuli; None where a device does."""
     simulation: SimulationTable | None
@@ -80,16 +89,39 @@ class StudyFile:
         the mistake."""
         return read_study(path, _identity)
 
+    @property
+    def tables(self) -> Content:
+        """The parsed file without its schema number; defaults are left out. `checked` makes the same file of it."""
+        return json.loads(self.content)
+
     @cached_property
     def hash(self) -> str:
-        """First 16 hex digits of the SHA-256 of the content, without [simulation] and [random_effect]: these do not
-        change the trials of participants, whose sessions may be over."""
-        tables = json.loads(self.content)
-        hashed = {name: table for name, table in tables.items() if name not in ("simulation", "random_effect")}
-        return hashlib.sha256(_as_json(hashed).encode()).hexdigest()[:16]
+        """First 16 hex digits of the SHA-256 of the content, without [simulation], [random_effect] and [validation]:
+        these do not change the trials of participants, whose sessions may be over."""
+        hashed = {name: table for name, table in self.tables.items() if name not in _NOT_HASHED}
+        return digest_of(_as_json(hashed).encode())
+
+    @cached_property
+    def meaning(self) -> str:
+        """First 16 hex digits of the SHA-256 of what responses mean (`meaning_part`), materials not considered.
+        Responses to studies of the same meaning are read together."""
+        return digest_of(json.dumps(meaning_part(self.tables), ensure_ascii=False, sort_keys=True).encode())
+
+    def changes(self, other: "StudyFile") -> list[str]:
+        """Keys that differ from another study file."""
+        return differing_keys(other.tables, self.tables)
+
+    def changes_of_meaning(self, other: "StudyFile") -> list[str]:
+        """Keys that differ from another study file and determine what responses mean; empty if `meaning` is the
+        same."""
+        return differing_keys(meaning_part(other.tables), meaning_part(self.tables))
+
+    def stored(self, tables: Content) -> "StudyFile":
+        """The file of `tables`, as a log holds them, under this file's path. Raises `InputError`."""
+        return checked({"schema": 1} | tables, self.source, _identity)
 
     def material(self, name: str) -> "StudyFile":
-        """The file of one material: its overrides of [renderer] and [parameters] applied. Raises `InputError` for a
+        """The file of one material: its overrides applied. Raises `InputError` for a
         name that is not in [materials]."""
         return _of_material(self, name)
 
@@ -136,17 +168,17 @@ def checked(raw: Mapping[str, Any], source: str, make: Callable[[StudyFile], _T]
 
 @lru_cache(maxsize=32)  # every event of a log may ask for its block's
 def _of_material(file: StudyFile, name: str) -> StudyFile:
-    """The file of one material: its overrides of [renderer] and [parameters] applied, without [materials]. Raises
+    """The file of one material: its overrides applied, without [materials]. Raises
     `InputError` for an unknown name. The last 32 are cached."""
     if name not in file.materials:
         listed = ", ".join(file.materials) or "there are none"
         raise InputError(f"{prefix(file.source)}materials.{name} is not in the study, its materials: {listed}.")
-    return checked(of_material({"schema": 1} | json.loads(file.content), name), file.source, _identity)
+    return checked(of_material({"schema": 1} | file.tables, name), file.source, _identity)
 
 
 def _file(raw: Mapping[str, Any], source: str) -> StudyFile:
     """The checked StudyFile of parsed tables; overrides in [materials] are not applied. Raises InputError."""
-    tables = read(raw)
+    tables = _without_default_goal(read(raw))
     box = box_of(tables)
     check_together(tables, box.parameters)
     return StudyFile(
@@ -157,6 +189,8 @@ def _file(raw: Mapping[str, Any], source: str) -> StudyFile:
         selection=tables.selection,
         session=tables.session,
         report=tables.report,
+        validation=tables.validation,
+        plan=tables.plan,
         stimulus=None if tables.renderer is not None else tables.stimulus or StimulusTable(),
         simulation=tables.simulation,
         random_effect=None if tables.random_effect is None else tables.random_effect.column,
@@ -164,6 +198,13 @@ def _file(raw: Mapping[str, Any], source: str) -> StudyFile:
         content=_as_json(msgspec.to_builtins(tables)),
         source=source,
     )
+
+
+def _without_default_goal(tables: Tables) -> Tables:
+    """The tables without a goal that is the highest response, which is the default."""
+    if tables.study.goal != tables.study.responses[-1]:
+        return tables
+    return msgspec.structs.replace(tables, study=msgspec.structs.replace(tables.study, goal=""))
 
 
 def _as_json(tables: Mapping[str, Any]) -> str:

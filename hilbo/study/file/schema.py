@@ -18,6 +18,7 @@ from hilbo.study.file.stimuli import StimulusTable
 from hilbo.study.file.trial_flags import FLAGS, TrialFlag
 
 __all__ = [
+    "KEY_NUMBERS",
     "NO_DELAY",
     "TABLES",
     "ConstraintTable",
@@ -25,10 +26,12 @@ __all__ = [
     "Inference",
     "LevelsTable",
     "ParameterTable",
+    "PlanTable",
     "RendererTable",
     "ReportTable",
     "Selection",
     "Tables",
+    "ValidationTable",
 ]
 
 Inference = Literal["laplace", "ep", "ep_corrected", "exact"]
@@ -36,7 +39,8 @@ Acquisition = Literal["ucb", "log_ei", "thompson", "top_category"]
 
 
 class StudyTable(_Table, frozen=True):
-    """[study]: name, response labels (lowest first), rated attribute and exclusion rules."""
+    """[study]: name, response labels (lowest first), the one that is the goal (by default the highest), rated attribute
+    and exclusion rules."""
 
     name: Annotated[str, msgspec.Meta(min_length=1), _text("a text", '"memory foam"')]
     responses: Annotated[
@@ -44,6 +48,7 @@ class StudyTable(_Table, frozen=True):
         msgspec.Meta(min_length=2),
         _text("a list of two or more texts, lowest first", '["different", "similar", "close"]'),
     ]
+    goal: Annotated[str, _text("one of the responses", '"close"')] = ""
     attribute: Annotated[str, msgspec.Meta(min_length=1), _text("a text", '"perceived realism"')] = "perceived realism"
     exclude: Annotated[str, _text("a rule, or nothing", '"trials < 10 or lapse_low > 0.3"')] = ""
     exclude_flags: Annotated[
@@ -152,11 +157,50 @@ class RandomEffectTable(_Table, frozen=True):
     column: Annotated[str, msgspec.Meta(min_length=1), _text("the name of a column", '"clip"')]
 
 
+KEY_NUMBERS = (
+    "population_error",
+    "individual_error",
+    "mean_of_optima_error",
+    "hyperparameter_shift",
+    "goal_answers",
+    "best_called",
+    "mid_called",
+    "worst_called",
+    "preferred",
+)
+"""Names of the key results of a study (`hilbo.report.study.key_numbers`), which other results may be put beside."""
+
+
 class ReportTable(_Table, frozen=True):
     """[report]: additions to `hilbo report`. `hypotheses`: evaluate the paper's hypotheses H1 to H4, and name the
-    paper's figure that each figure corresponds to."""
+    paper's figure that each figure corresponds to. `compare_with`: key result -> what another study found."""
 
     hypotheses: Annotated[bool, _text("true or false", "true")] = False
+    compare_with: Annotated[
+        dict[str, str | float],
+        _text("a table of numbers or texts", '{population_error = 4, individual_error = "24 (13 to 41)"}'),
+    ] = msgspec.field(default_factory=dict)
+
+
+class ValidationTable(_Table, frozen=True):
+    """`[validation]`: conditions on the sets mid and worst of a validation.
+
+    `known`: largest standard deviation of the map there, over that without responses; `apart`: least distance of mid
+    from best and worst, in the unit cube.
+    """
+
+    known: Annotated[float, msgspec.Meta(gt=0, le=1), _text("a number above 0, at most 1", "0.8")] = 0.8
+    apart: Annotated[_NotNegative, msgspec.Meta(examples=["0.2"])] = 0.2
+
+
+class PlanTable(_Table, frozen=True):
+    """[plan]. `people`: material -> number of participants who optimise it; each is assigned to one of them at random.
+    Without it every participant has all materials."""
+
+    people: Annotated[
+        dict[str, Annotated[int, msgspec.Meta(ge=1, le=100_000)]],
+        _text("a table of materials and numbers of participants", "{foam = 24, medium = 8, stiff = 8}"),
+    ] = msgspec.field(default_factory=dict)
 
 
 class Tables(_Table, frozen=True):
@@ -174,6 +218,8 @@ class Tables(_Table, frozen=True):
     stimulus: StimulusTable | None = None
     simulation: SimulationTable | None = None
     random_effect: RandomEffectTable | None = None
+    validation: ValidationTable = ValidationTable()
+    plan: PlanTable = PlanTable()
     constraints: tuple[ConstraintTable, ...] = ()
 
 
@@ -187,4 +233,6 @@ TABLES = {
     "stimulus": StimulusTable,
     "simulation": SimulationTable,
     "random_effect": RandomEffectTable,
+    "validation": ValidationTable,
+    "plan": PlanTable,
 }

@@ -26,7 +26,8 @@ class SimulationTable(Table, frozen=True):
     `truth`: parameter -> centre of their optima, in physical units; drawn from the feasible set if left out. `spread`:
     between-participant sd of optima (for levels the proportion who prefer another one), and `tolerance`: the distance
     at which the highest response ends, both as fractions of the ranges. `criteria`: C - 1 falling distances in
-    tolerances, below the last of which the response is the highest. `noise`: sd of the perceived dissimilarity, in
+    tolerances, below the last of which the response is the highest; for a goal other than the highest response, those
+    above it are negative. `noise`: sd of the perceived dissimilarity, in
     tolerances. `lapse`: proportion of random responses.
     """
 
@@ -36,13 +37,14 @@ class SimulationTable(Table, frozen=True):
     spread: _Parts = 0.12
     tolerance: _Parts = 0.2
     tolerance_sd: NotNegative = 0.4
-    criteria: Annotated[tuple[Positive, ...], words("a list of falling numbers above 0", "[2.5, 1]")] = ()
+    criteria: Annotated[tuple[float, ...], words("a list of falling numbers", "[2.5, 1]")] = ()
     noise: Annotated[Positive, msgspec.Meta(examples=["0.7"])] = 0.7
     lapse: Annotated[float, msgspec.Meta(ge=0, le=1), words("a number from 0 to 1", "0.05")] = 0.05
     drift_sd: NotNegative = 0.2
 
-    def check(self, parameters: Sequence[Parameter], count: int) -> None:
-        """Raise `InputError` if the table does not fit these parameters and `count` responses."""
+    def check(self, parameters: Sequence[Parameter], count: int, below: int) -> None:
+        """Raise `InputError` if the table does not fit these parameters and `count` responses, of which so many are
+        `below` the goal."""
         names = [p.name for p in parameters]
         if self.truth and set(self.truth) != set(names):
             raise InputError(f"simulation.truth names {', '.join(self.truth)}; it must name {', '.join(names)}.")
@@ -65,6 +67,13 @@ class SimulationTable(Table, frozen=True):
             raise InputError(
                 f"simulation.criteria is {shown(self.criteria)}; it must fall from each number to the next."
             )
+        if 0 in self.criteria or (self.criteria and sum(value > 0 for value in self.criteria) != below):
+            signs = (
+                "above 0"
+                if below == count - 1
+                else f"{below} above 0 and {count - 1 - below} below, one for each answer"
+            )
+            raise InputError(f"simulation.criteria is {shown(self.criteria)}; its numbers must be {signs}.")
 
 
 def each(values: float | tuple[float, ...], dim: int) -> tuple[float, ...]:

@@ -1,6 +1,7 @@
 """The tables of a study file: parsed into records, and checks of each and of their combination. Loads no JAX."""
 
 import itertools
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -10,8 +11,10 @@ from hilbo.errors import InputError
 from hilbo.population.rules.registry import DEFAULT, GIVEN, RECOMMENDED, RULES, WITHDRAWN
 from hilbo.search.box import Box, Constraint, Mechanics, Parameter
 from hilbo.study.file.fields import check_keys, check_present, check_table, missing_keys, read_table, shown
+from hilbo.study.file.protocols import PHASES
 from hilbo.study.file.reserved_names import TRIAL_COLUMNS, is_reserved
 from hilbo.study.file.schema import (
+    KEY_NUMBERS,
     NO_DELAY,
     TABLES,
     ConstraintTable,
@@ -21,13 +24,15 @@ from hilbo.study.file.schema import (
     RendererTable,
     Tables,
 )
+from hilbo.study.formats.cell_text import check_text
 
 __all__ = ["box_of", "check_together", "of_material", "read"]
 
 _REQUIRED = ("schema", "study", "parameters")
 _KEYS = ("schema", "study", "parameters", "renderer", *list(TABLES)[1:], "constraints", "materials")
 _LEARNT = ("theta", "variance", "thresholds", "noise")
-_OVERRIDES = ("renderer", "parameters")
+_OVERRIDES = ("renderer", "parameters", "session", "report")
+_PHASES = tuple(phase.replace("-", "_") for phase in PHASES)
 _NUMBERS_KEYS = ("low", "high", "unit", "scale", "integer")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
 
@@ -56,6 +61,8 @@ def read(raw: Mapping[str, Any]) -> Tables:
     for name, table in materials.items():
         check_keys(table, f"materials.{name}", _OVERRIDES)
         check_keys(table.get("parameters", {}), f"materials.{name}.parameters", tuple(raw["parameters"]))
+        check_keys(table.get("session", {}), f"materials.{name}.session", _PHASES)
+        check_keys(table.get("report", {}), f"materials.{name}.report", ("compare_with",))
     return Tables(parameters=parameters, materials=dict(materials), **tables)
 
 
@@ -152,10 +159,26 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
     labels, selection = tables.study.responses, tables.selection
     if len(set(labels)) < len(labels):
         raise InputError(f"study.responses is {shown(labels)}; it must not have one label twice.")
+    goal = tables.study.goal
+    if goal and goal not in labels:
+        raise InputError(f"study.goal is {shown(goal)}; it must be one of the responses, {', '.join(labels)}.")
+    if goal in labels[1:-1] and selection.acquisition == "log_ei":
+        raise InputError(
+            'selection.acquisition is "log_ei", which has no form for a goal between other responses; use "ucb".'
+        )
     if selection.space_filling > selection.trials:
         raise InputError(
             f"selection.space_filling is {selection.space_filling}; it must be at most trials = {selection.trials}."
         )
+    unknown = [name for name in tables.plan.people if name not in tables.materials]
+    if unknown:
+        listed = ", ".join(tables.materials) or "there are none"
+        raise InputError(f"plan.people.{unknown[0]} is of no material of the study, its materials: {listed}.")
+    check_keys(tables.report.compare_with, "report.compare_with", KEY_NUMBERS)
+    for name, value in tables.report.compare_with.items():
+        check_text(str(value), name, "report.compare_with")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"report.compare_with.{name} is {value}; it must be a finite number or a text.")
     rendered = tables.renderer is not None
     reserved = next((p.name for p in parameters if is_reserved(p.name, labels, rendered)), None)
     if reserved is not None:
@@ -169,7 +192,7 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
         if tables.renderer is not None:
             raise InputError("stimulus stands beside renderer, a study has one: a program presents, or a device.")
     if tables.simulation is not None:
-        tables.simulation.check(parameters, len(labels))
+        tables.simulation.check(parameters, len(labels), labels.index(goal) if goal else len(labels) - 1)
     _check_gp(tables.gp, tables.aggregation.rule, len(labels))
     column = "" if tables.random_effect is None else tables.random_effect.column
     if column in TRIAL_COLUMNS or column in {p.name for p in parameters} or column.startswith("_"):
@@ -195,8 +218,9 @@ def _check_gp(table: GPTable, rule: str, count: int) -> None:
 
 
 def of_material(raw: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Parsed file of one material: its overrides applied, and [materials] removed. `name` must be in [materials]."""
-    tables = {key: value for key, value in raw.items() if key != "materials"}
+    """Parsed file of one material: its overrides applied, [materials] and [plan] removed. `name` must be in
+    [materials]."""
+    tables = {key: value for key, value in raw.items() if key not in ("materials", "plan")}
     for table, changes in raw["materials"][name].items():
         tables[table] = _merged(tables.get(table, {}), changes)
     return tables

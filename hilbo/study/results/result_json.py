@@ -34,6 +34,8 @@ class Result(msgspec.Struct, frozen=True):
     """The part of a result.json that other commands use."""
 
     study: str
+    meaning: str
+    goal: str
     optimum: FoundOptimum
     participants: tuple[FoundPerson, ...]
     seed: Annotated[int, msgspec.Meta(ge=0, lt=2**31)] = 0
@@ -42,16 +44,21 @@ class Result(msgspec.Struct, frozen=True):
 
 
 def read_result(path: str | os.PathLike, study: Study) -> Result:
-    """Read and check the result.json of this study. Raises InputError for a file that cannot be read, was changed,
-    or is of another study, for no, invalid or repeated participants, and for optima that are out of range or not
-    passive."""
+    """Read and check the result.json of this study. Raises InputError for a file that cannot be read, was changed, or
+    is of a study whose responses mean something else, for no, invalid or repeated participants, and for optima that
+    are out of range or not passive."""
     source, content = str(path), read_bytes(path)
     result: Result = decoded(content, Result, source, _WHAT)
     check_seal(content, result.digest, source)
-    if result.study != study.file.hash:
+    if result.meaning != study.file.meaning:
         raise InputError(
-            f"{path}: is the result of another study ({result.study}, not {study.file.hash}); aggregate the answers"
-            " again with this study file."
+            f"{path}: is the result of another study ({result.study}, not {study.file.hash}), in which responses mean"
+            " something else; aggregate the answers again with this study file."
+        )
+    if result.goal != study.goal_label:
+        raise InputError(
+            f'{path}: is the optimum of "{result.goal}", and the study\'s goal is "{study.goal_label}"; aggregate the'
+            " answers again."
         )
     if not result.participants:
         raise InputError(f"{path}: holds no participants; aggregate the answers again.")

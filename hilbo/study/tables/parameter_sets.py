@@ -124,13 +124,15 @@ def _value(
             check_id(text.removeprefix(_INDIVIDUAL), place)
         check_text(text, "source", place)
         return text
-    if comma and column in (*_WHOLE, *_NUMBERS, "T", *needs):
+    numeric = (*_NUMBERS, "T", *needs)
+    number = column in numeric or column.removesuffix("_low").removesuffix("_high") in numeric
+    if comma and (number or column in _WHOLE):
         text = without_decimal_comma(text)
     if column in _WHOLE:
         if not re.fullmatch(r"\d{1,9}(\.0*)?", text) or int(float(text)) < 1:
             raise InputError(f'{place}: {column} is "{text}"; it must be a whole number from 1.')
         return int(float(text))
-    if column not in (*_NUMBERS, "T", *needs):
+    if not number:
         check_text(text, column, place)
         return text
     if not _NUMERAL.fullmatch(text) or not math.isfinite(float(text)):
