@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 
 from hilbo.study.file.plan_file import Plan
-from hilbo.study.tables.sessions import Held
+from hilbo.study.tables.sessions import SessionRow
 
 __all__ = ["PHASE", "changed_files", "departures"]
 
@@ -17,7 +17,7 @@ PHASE = "optimisation"
 def departures(
     plans: Sequence[Plan],
     counts: Mapping[str, Mapping[str, int]],
-    held: Sequence[Held] | None = None,
+    held: Sequence[SessionRow] | None = None,
     study_hash: str = "",
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Compare sessions with their plans; returns (deviations, confirmations), each a tuple of sentences. Plans of one
@@ -45,10 +45,10 @@ def departures(
     return tuple(deviations), tuple(confirmations)
 
 
-def changed_files(held: Sequence[Held]) -> tuple[str, ...]:
+def changed_files(held: Sequence[SessionRow]) -> tuple[str, ...]:
     """Sentences on sessions that were begun with a version of the study file other than the one of the export, one for
     each version, in the order of their first session: which keys differ, which sessions, and from when to when."""
-    versions: dict[str, list[Held]] = {}
+    versions: dict[str, list[SessionRow]] = {}
     for session in sorted(held, key=lambda session: math.inf if session.began_at is None else session.began_at):
         if session.differs_in:
             versions.setdefault(session.study, []).append(session)
@@ -59,7 +59,7 @@ def changed_files(held: Sequence[Held]) -> tuple[str, ...]:
     )
 
 
-def _between(sessions: Sequence[Held]) -> str:
+def _between(sessions: Sequence[SessionRow]) -> str:
     """The days of the first and the last of these sessions, in UTC, as words; empty if no session has a time."""
     times = [session.began_at for session in sessions if session.began_at is not None]
     days = list(dict.fromkeys(datetime.fromtimestamp(t, UTC).date().isoformat() for t in times))
@@ -74,7 +74,7 @@ def _latest(plans: Sequence[Plan]) -> list[Plan]:
     return list({plan.hash: plan for plan in plans if plan.hash not in replaced}.values())
 
 
-def _other_files(plans: Sequence[Plan], held: Sequence[Held] | None, study_hash: str) -> list[str]:
+def _other_files(plans: Sequence[Plan], held: Sequence[SessionRow] | None, study_hash: str) -> list[str]:
     """Sentences on sessions, or without a table of sessions on responses, whose study file is not the one that a plan
     was made from."""
     planned = {plan.study for plan in plans}
@@ -83,11 +83,11 @@ def _other_files(plans: Sequence[Plan], held: Sequence[Held] | None, study_hash:
         same = not study_hash or study_hash in planned
         return [] if same else [f"The study file has changed since the plan was made ({study_hash}, {words})."]
     others = [f"{s.participant} (session {s.session}, {s.study})" for s in held if s.study not in planned]
-    return [f"Held with another study file ({words}): {', '.join(others)}."] if others else []
+    return [f"Sessions with another study file ({words}): {', '.join(others)}."] if others else []
 
 
 def _of_optimisations(
-    plans: Sequence[Plan], counts: Mapping[str, Mapping[str, int]], held: Sequence[Held] | None
+    plans: Sequence[Plan], counts: Mapping[str, Mapping[str, int]], held: Sequence[SessionRow] | None
 ) -> list[str]:
     """Sentences on participants and numbers of responses that differ from the plans, and on other plans that were
     followed."""
@@ -104,7 +104,7 @@ def _of_optimisations(
     return sentences
 
 
-def _of_comparisons(plans: Sequence[Plan], held: Sequence[Held]) -> list[str]:
+def _of_comparisons(plans: Sequence[Plan], held: Sequence[SessionRow]) -> list[str]:
     """Sentences on participants who lack a planned session of comparisons or were not planned, and on other plans that
     were followed."""
     planned = list(dict.fromkeys(row.participant for plan in plans for row in plan.participants))
@@ -125,7 +125,7 @@ def _who(planned: Collection[str], had: Collection[str], what: str) -> list[str]
     return sentences
 
 
-def _confirmed(plans: Sequence[Plan], held: Sequence[Held] | None) -> str:
+def _confirmed(plans: Sequence[Plan], held: Sequence[SessionRow] | None) -> str:
     """What agrees with the plans, as the end of a sentence: number of participants, of their answers, and whether their
     sessions are known to follow the plans."""
     people = len({row.participant for plan in plans for row in plan.participants})
@@ -161,7 +161,7 @@ def _in_place_of(name: str, here: Mapping[str, int], planned: Mapping[str, int])
     return f"{name} ({', '.join(words)})" if words else ""
 
 
-def _other_plans(plans: Sequence[Plan], held: Sequence[Held]) -> list[str]:
+def _other_plans(plans: Sequence[Plan], held: Sequence[SessionRow]) -> list[str]:
     """Up to two sentences: sessions without a plan, and sessions under a plan other than these or those they
     replace."""
     own = {hash for plan in plans for hash in (plan.hash, *plan.replaces)}
@@ -171,5 +171,5 @@ def _other_plans(plans: Sequence[Plan], held: Sequence[Held]) -> list[str]:
         for session in held
         if session.plan and session.plan not in own
     ]
-    sentences = [f"Held by no plan: {', '.join(none)}."] if none else []
-    return sentences + ([f"Held by another plan: {', '.join(other)}."] if other else [])
+    sentences = [f"Sessions without a plan: {', '.join(none)}."] if none else []
+    return sentences + ([f"Sessions by another plan: {', '.join(other)}."] if other else [])

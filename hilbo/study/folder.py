@@ -30,7 +30,7 @@ from hilbo.study.file.plan_file import read_plan
 from hilbo.study.file.trial_flags import FlagCounts, flag_sentences
 from hilbo.study.formats.csv_file import cell_pieces, numbers, parameter_values, read_cells
 from hilbo.study.tables.flag_counts import flag_counts
-from hilbo.study.tables.sessions import Held, read_held
+from hilbo.study.tables.sessions import SessionRow, read_session_table
 from hilbo.study.tables.trials import NothingToFitError, TrialTable, check_texts, joined, trial_table
 from hilbo.study.tables.validation import check_validation, sets_frame
 
@@ -73,7 +73,7 @@ class StudyFolder(NamedTuple):
     """Sentences: deviations from the plan, and information that the tables lack."""
     notes: tuple[str, ...] = ()
     """Sentences: confirmation of the plan, and flags of comparisons."""
-    sessions: list[Held] | None = None
+    sessions: list[SessionRow] | None = None
 
 
 def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
@@ -106,7 +106,7 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     }
     _check_materials_named(names, tables)
     materials = [_material(name, study, cells, compared, sets, truth) for name in names]
-    held = read_held(folder)
+    held = read_session_table(folder)
     departs, as_planned = _departures(folder, study, materials, held)
     limits = (*departs, *changed_files(held or ()), *_missing_tables(study, materials, compared, sets))
     flags = flag_sentences(flag_counts(*validation), study.file.exclude_flags, "comparisons") if validation else []
@@ -301,15 +301,14 @@ def _end(study: Study, row: pd.DataFrame, end: str) -> Float[np.ndarray, " d"] |
 
 
 def _departures(
-    folder: Path, study: Study, materials: list[Material], held: list[Held] | None
+    folder: Path, study: Study, materials: list[Material], held: list[SessionRow] | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Compare the sessions with the plans in plan.json or plan-*.json; returns (sentences on deviations, sentences that
     confirm a plan); both are empty without a plan. Responses excluded for their flags are counted too. Raises
     InputError."""
     plans = {path: read_plan(path) for path in sorted([*folder.glob("plan.json"), *folder.glob("plan-*.json")])}
     for path, plan in plans.items():
-        meanings = [(study.file.material(name) if name else study.file).meaning for name in plan.materials]
-        if list(plan.meaning) != meanings:
+        if plan.meaning != study.file.meanings(plan.materials):
             raise InputError(f"{path}: is the plan of another study ({plan.study}); remove it from the folder.")
     counts: dict[str, dict[str, int]] = {}
     for material in materials:

@@ -301,7 +301,7 @@ def test_a_report_reads_the_folder_of_an_export(hilbo, tmp_path):
     assert set(folder.sets.index) == {*"DEF", "measured"} and material.reference.name == "system identification"
     assert any("P01" in sentence for sentence in folder.limits)  # the plan is looked at
     assert any(
-        sentence.endswith("Held by no plan: P02 (session 1).") for sentence in folder.limits
+        sentence.endswith("Sessions without a plan: P02 (session 1).") for sentence in folder.limits
     )  # not its comparisons
     (tmp_path / "tables" / "sets.csv").write_text("set_id,source,u,v\nD,sysid,0.3,0.6\n")
     with pytest.raises(InputError, match='the set "D" is in two sets tables; keep one'):

@@ -15,7 +15,7 @@ from hilbo.report.study.sessions import described, session_rows
 from hilbo.report.validation import validate
 from hilbo.study.analysis.analysis import Analysis
 from hilbo.study.folder import Reference, _reference
-from hilbo.study.tables.sessions import Held
+from hilbo.study.tables.sessions import SessionRow, read_session_table
 
 OWN = np.array([[0.1, 0.5], [0.9, 0.5], [0.5, 0.8], [0.3, 0.5]])
 OTHERS = {"population_error": 4.0, "individual_error": "24 (13 to 41)", "preferred": 72.75}
@@ -102,9 +102,10 @@ def test_a_reference_has_the_interval_of_its_identification():
 
 def test_sessions_are_counted_by_their_phases():
     held = [
-        Held(name, "1", "warm-up, optimisation", "", 0.0, end, "s", "") for name, end in (("A", 600.0), ("B", 720.0))
+        SessionRow(name, "1", "warm-up, optimisation", "", 0.0, end, "s", "")
+        for name, end in (("A", 600.0), ("B", 720.0))
     ]
-    held.append(Held("A", "2", "validation", "", None, None, "s", ""))
+    held.append(SessionRow("A", "2", "validation", "", None, None, "s", ""))
     assert session_rows(held) == [
         ["warm-up, optimisation", "2", "2", "11 (10 to 12)"],
         ["validation", "1", "1", "–"],
@@ -123,3 +124,12 @@ def test_people_are_described_without_a_row_of_anybody():
     assert about["words"] == f"4 participants: {ages}; {hands}."
     assert about["mean_age"] == 25.0 and "P01" not in str(about)
     assert described({}, ["P01"])["words"] == "1 participant; their ages and handedness are not known."
+
+
+@pytest.mark.parametrize("time", ["noon", "nan", "-inf"])
+def test_a_table_of_sessions_with_a_time_that_is_no_number_is_refused(tmp_path, time):
+    (tmp_path / "data").mkdir()
+    path = tmp_path / "data" / "study-x_table-sessions_data.csv"
+    path.write_text(f"{','.join(SessionRow._fields)}\nA,1,optimisation,,{time},5,s,\n")
+    with pytest.raises(InputError, match=f'began_at is "{time}"; it must be a number of seconds'):
+        read_session_table(tmp_path)

@@ -14,7 +14,7 @@ from hilbo.study.departures import changed_files, departures
 from hilbo.study.estimate.optimum import _LOSS
 from hilbo.study.file.plan_file import plan_text, read_plan
 from hilbo.study.file.reading import StudyFile
-from hilbo.study.tables.sessions import Held
+from hilbo.study.tables.sessions import SessionRow
 from hilbo.study.template import NewStudy, parameter_of, study_text
 
 PAPER = Path("hilbo/data/paper.toml")
@@ -100,7 +100,7 @@ PLANNED = StudyFile.load(PAPER).hash
 
 
 def session_of(name, plan, phases="warm-up, optimisation", began=0.0, study=PLANNED, differs=""):
-    return Held(name, "1", phases, plan, began, None, study, differs)
+    return SessionRow(name, "1", phases, plan, began, None, study, differs)
 
 
 def test_the_page_has_groups_and_protocols_by_material(tmp_path):
@@ -156,7 +156,7 @@ def test_sessions_of_several_plans_are_compared_phase_by_phase(tmp_path):
     assert sentence.startswith(f"Departs from the plan {asked.hash}. Planned, and without a session here: V02 (1 of 2)")
     held.append(session_of("V02", "", "warm-up, validation"))
     (sentence,), _ = departures([one, asked, two], counts, held)
-    assert sentence.endswith("Held by no plan: V02 (session 1).")
+    assert sentence.endswith("Sessions without a plan: V02 (session 1).")
     held[-1] = session_of("V02", asked.hash, "warm-up, validation")
     departs, said = departures([one, asked, two], counts, held)
     assert departs == () and said[1].endswith("2 participants of the validation; all sessions followed it.")
@@ -211,9 +211,9 @@ def test_sessions_that_were_held_by_no_plan_or_by_another_are_named(tmp_path):
     assert departs == () and nothing.endswith("25 answers each; all sessions followed it.")
     assert "which plan the sessions followed is not known here" in departures([plan], counts)[1][0]
     (sentence,), nothing = said(own, "")
-    assert nothing == () and sentence == f"Departs from the plan {own}. Held by no plan: P02 (session 1)."
+    assert nothing == () and sentence == f"Departs from the plan {own}. Sessions without a plan: P02 (session 1)."
     (sentence,), _ = said("0123", own)
-    assert sentence.endswith("Held by another plan: P01 (session 1, plan 0123).")
+    assert sentence.endswith("Sessions by another plan: P01 (session 1, plan 0123).")
     (sentence,), _ = said(own)
     assert sentence.endswith("does not say by which plan these were held: P02.")
     twice = reissue(reissue(plan, "P02", "P03"), "P03", "P04")

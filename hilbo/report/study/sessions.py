@@ -7,17 +7,17 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from hilbo.study.formats.json_file import Content
-from hilbo.study.tables.sessions import Held
+from hilbo.study.tables.sessions import SessionRow
 
 __all__ = ["SESSIONS_HEAD", "described", "session_rows"]
 
 SESSIONS_HEAD = ("sessions", "number", "participants", "minutes, median (shortest to longest)")
 
 
-def session_rows(held: Sequence[Held]) -> list[list[str]]:
+def session_rows(held: Sequence[SessionRow]) -> list[list[str]]:
     """Rows of the page's table, as texts, one for each combination of phases. Durations are from the first to the last
     event, breaks included, and "–" without events."""
-    kinds: dict[str, list[Held]] = {}
+    kinds: dict[str, list[SessionRow]] = {}
     for session in held:
         kinds.setdefault(session.phases, []).append(session)
     return [
@@ -49,7 +49,7 @@ def described(people: Mapping[str, Mapping[str, str]], names: Sequence[str]) -> 
     }
 
 
-def _minutes(held: Sequence[Held]) -> str:
+def _minutes(held: Sequence[SessionRow]) -> str:
     """Median, smallest and largest duration in minutes, as text."""
     times = [(s.ended_at - s.began_at) / 60 for s in held if s.began_at is not None and s.ended_at is not None]
     if not times:

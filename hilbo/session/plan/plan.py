@@ -85,7 +85,7 @@ def make_plan(
     plan = Plan(
         schema=1,
         study=study.hash,
-        meaning=tuple(study_of(study, name).meaning for name in names),
+        meaning=study.meanings(names),
         name=study.name,
         seed=seed,
         phase=phase,
@@ -156,8 +156,8 @@ def check_plan(plan: Plan, study: StudyFile) -> None:
     valid or of another participant."""
     if len(plan.meaning) != len(plan.materials):
         raise InputError("the plan does not say what responses to each of its materials mean; make a new one.")
-    for name, meaning in zip(plan.materials, plan.meaning, strict=True):
-        if study_of(study, name).meaning != meaning:
+    for name, planned, meaning in zip(plan.materials, plan.meaning, study.meanings(plan.materials), strict=True):
+        if planned != meaning:
             raise InputError(
                 f"the plan belongs to another study ({plan.study}, not {study.hash}): parameters, responses, questions,"
                 f" renderer or stimulus{f' of {name}' if name else ''} differ; use the study file it was made from."

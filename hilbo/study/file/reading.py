@@ -10,7 +10,7 @@ the parameters does. A second hash covers the keys on which the meaning of respo
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -106,6 +106,11 @@ class StudyFile:
         """First 16 hex digits of the SHA-256 of what responses mean (`meaning_part`), materials not considered.
         Responses to studies of the same meaning are read together."""
         return digest_of(json.dumps(meaning_part(self.tables), ensure_ascii=False, sort_keys=True).encode())
+
+    def meanings(self, materials: Sequence[str | None]) -> tuple[str, ...]:
+        """`meaning` of the file of each of the materials; None: of this file. Raises `InputError` for a name that is
+        not in [materials]."""
+        return tuple((self.material(name) if name else self).meaning for name in materials)
 
     def changes(self, other: "StudyFile") -> list[str]:
         """Keys that differ from another study file."""
