@@ -116,6 +116,10 @@ def robustness(
         str, typer.Option(help="Optimised hyperparameters, separated by commas; a rule that learns them learns all.")
     ] = "theta,noise,thresholds",
     material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
+    pilot: Annotated[
+        bool,
+        typer.Option("--pilot", help="Print the optimised hyperparameters as [gp], with 95 % intervals, for a study."),
+    ] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -126,14 +130,20 @@ def robustness(
     with results(out, force) as folder, progress() as say:
         chosen, everybody, flagged = read_cohort(trials, study, material, say)
         cohort, left_out = _included(chosen, everybody)
-        from hilbo.report.robustness import write_robustness
+        from hilbo.report.robustness import gp_table, write_robustness
+        from hilbo.study.analysis import pilot as pilots
         from hilbo.study.analysis.robustness import robustness as check
 
+        if pilot:
+            pilots.check_pilot(chosen, cohort)
         say("hyperparameters by maximum evidence")
         comparison = check(chosen, cohort, seed, learn=tuple(name.strip() for name in learn.split(",")))
+        sure = pilots.pilot(chosen, cohort, comparison.hyperparameters, say) if pilot else None
         say("maps, figures and report")
-        content = write_robustness(chosen, cohort, comparison, folder, seed, [*flagged, *left_out])
+        content = write_robustness(chosen, cohort, comparison, folder, seed, [*flagged, *left_out], sure)
     finish(content, out, as_json)
+    if pilot and not as_json:
+        print(gp_table(content))
 
 
 def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tuple[Any, Any, list[str]]:

@@ -12,6 +12,7 @@ from hilbo.report.page import Pictures, rendered
 from hilbo.report.result_file import write_result
 from hilbo.report.results import optimum_content, save_figures, versions
 from hilbo.study.analysis.heterogeneity import how_aggregated
+from hilbo.study.analysis.pilot import Pilot
 from hilbo.study.analysis.robustness import LIMIT, NEAR, Place, Robustness
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
@@ -21,21 +22,28 @@ from hilbo.study.estimate.location import location_notes
 from hilbo.study.formats.json_file import Content
 from hilbo.study.results.map_netcdf import map_dataset
 
-__all__ = ["robustness_page", "robustness_result", "write_robustness"]
+__all__ = ["gp_table", "robustness_page", "robustness_result", "write_robustness"]
 
 _TENTH = 0.1  # of every search range: two renderings that a person would hardly tell apart
 _UNRELATED = 0.1
 
 
 def write_robustness(
-    study: Study, cohort: Cohort, check: Robustness, folder: Path, seed: int = 0, left_out: Sequence[str] = ()
+    study: Study,
+    cohort: Cohort,
+    check: Robustness,
+    folder: Path,
+    seed: int = 0,
+    left_out: Sequence[str] = (),
+    pilot: Pilot | None = None,
 ) -> Content:
     """Write result.json, map.nc (both maps), the figures and report.html into an existing folder; return the content of
     result.json.
 
-    `left_out`: sentences on excluded participants, which become the first warnings; `seed`: only recorded.
+    `left_out`: sentences on excluded participants, which become the first warnings; `seed`: only recorded; `pilot`:
+    intervals of the optimised hyperparameters.
     """
-    content = robustness_result(study, cohort, check, seed)
+    content = robustness_result(study, cohort, check, seed, pilot)
     content["warnings"] = [*left_out, *content["warnings"]]
     write_result(content, folder)
     maps = [map_dataset(study, lambda x, of=of: of(jnp.asarray(x))) for of in _maps(check)]
@@ -70,14 +78,37 @@ def robustness_page(study: Study, content: Content, figures: Pictures) -> str:
         predicts=RULES[study.rule].predicts,
         sensitivity={name: np.atleast_2d(np.asarray(block).T) for name, block in blocks.items()},
         how=content["aggregated"],
-        table=None if study.gp.kernel.levels else _table(content["learned"]),
+        table=None if study.gp.kernel.levels else gp_table(content),
     )
 
 
-def _table(learned: Content) -> str:
-    """The optimised hyperparameters as a [gp] table of a study file, TOML text with four significant digits."""
-    names = ("theta", "variance", "thresholds", "noise")
-    return "\n".join(["[gp]", *(f"{name} = {_four_digits(learned[name])}" for name in names)])
+def gp_table(content: Content) -> str:
+    """The optimised hyperparameters as a [gp] table of a study file, TOML text with four significant digits; with a
+    pilot's intervals as comments. `content`: of `write_robustness`."""
+    learned, pilot = content["learned"], content["pilot"]
+    intervals = pilot["intervals"] if pilot else {}
+    lines = ["[gp]"]
+    if pilot:
+        lines[0] = f"[gp] # by the answers of {pilot['participants']} people; 95 % intervals by the jackknife over them"
+    for name in ("theta", "variance", "thresholds", "noise"):
+        ends = ", ".join(f"{low:.3g} to {high:.3g}" for low, high in intervals.get(name, []))
+        remark = f"95 %: {ends}" if ends else "as in the study file"
+        lines.append(f"{name} = {_four_digits(learned[name])}" + (f" # {remark}" if pilot else ""))
+    return "\n".join(lines)
+
+
+def _unfinished(pilot: Pilot) -> list[str]:
+    """A sentence on searches of the jackknife that did not converge, if any."""
+    if not pilot.unfinished:
+        return []
+    names = ", ".join(pilot.unfinished)
+    return [f"The intervals of the hyperparameters are rough: without {names} the search for them did not converge."]
+
+
+def _pilot_content(pilot: Pilot) -> Content:
+    """A pilot as an entry of result.json."""
+    intervals = {name: ends.tolist() for name, ends in pilot.intervals.items()}
+    return {"participants": pilot.participants, "intervals": intervals, "unfinished": list(pilot.unfinished)}
 
 
 def _four_digits(value: float | list[float]) -> str:
@@ -100,18 +131,20 @@ def _figures(study, cohort, check):
     }
 
 
-def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int) -> Content:
+def robustness_result(
+    study: Study, cohort: Cohort, check: Robustness, seed: int, pilot: Pilot | None = None
+) -> Content:
     """The content of result.json of `hilbo robustness`, without excluded participants' sentences.
 
     The optima and their distances (NRMSE), that of each participant, the optimised hyperparameters and their criterion,
-    and the optimum's derivatives by them. `seed`: only recorded.
+    and the optimum's derivatives by them. `seed`: only recorded; `pilot`: intervals of the optimised hyperparameters.
     """
     both = check.hyperparameters
     model = both.optimised.gp
     moves = zip(cohort.names, check.individual_nrmse.tolist(), strict=True)
     resampled = check.resampled
     return {
-        "warnings": _warnings(check),
+        "warnings": [*_warnings(check), *(_unfinished(pilot) if pilot else ())],
         "fixed": _place_content(both.fixed, check.fixed_aggregate, check.fixed),
         "optimised": _place_content(both.optimised, check.optimised_aggregate, check.optimised),
         "local": check.local and _place_content(both.optimised, check.optimised_aggregate, check.local),
@@ -135,6 +168,7 @@ def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int
             "noise": np.asarray(model.likelihood.noise).tolist(),
             "thresholds": np.asarray(model.likelihood.thresholds).tolist(),
         },
+        "pilot": pilot and _pilot_content(pilot),
         "sensitivity": check.sensitivity and {name: np.asarray(v).tolist() for name, v in check.sensitivity.items()},
         "study": study.file.hash,
         "seed": seed,

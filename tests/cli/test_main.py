@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import typer
 import xarray as xr
 from commands import run
 
+from hilbo import Study
 from hilbo.cli.main import app
 
 VIDEO = ["hilbo/data/video_quality.csv", "--study", "hilbo/data/video_quality.toml"]
@@ -62,6 +64,23 @@ def test_aggregate_writes_everything(capsys, monkeypatch, tmp_path):
     code, _, stderr = run(capsys, monkeypatch, "aggregate", *VIDEO, "--out", out)
     assert (code, (out / "result.json").read_bytes()) == (2, before)
     assert "--force" in stderr
+
+
+@pytest.mark.deep
+def test_a_pilot_prints_hyperparameters_that_a_study_file_takes(capsys, monkeypatch, tmp_path):
+    table = pd.read_csv(VIDEO[0], dtype=str)
+    table[table["participant"].isin(["V01", "V02", "V03"])].to_csv(tmp_path / "pilot.csv", index=False)
+    what = "robustness", tmp_path / "pilot.csv", *VIDEO[1:], "--out", tmp_path / "pilot", "--pilot"
+    code, printed, _ = run(capsys, monkeypatch, *what)
+    assert code == 0 and "by the answers of 3 people" in printed
+    given, content = tomllib.loads(printed)["gp"], json.loads((tmp_path / "pilot" / "result.json").read_text())
+    for name, ends in content["pilot"]["intervals"].items():
+        values = np.atleast_1d(given[name])
+        assert len(values) == len(ends) and all(a < value < b for value, (a, b) in zip(values, ends, strict=True))
+        np.testing.assert_allclose(values, np.atleast_1d(content["learned"][name]), rtol=1e-3)
+    head, rest = Path(VIDEO[2]).read_text().split("[gp]")
+    (tmp_path / "study.toml").write_text(head + printed + rest[rest.index("\n[") :])
+    assert float(Study.load(tmp_path / "study.toml").gp.likelihood.noise) == given["noise"]
 
 
 @pytest.mark.deep
