@@ -189,7 +189,7 @@ def _study(path: Path) -> Iterator[Check]:
     except InputError as error:
         yield Check("feasible set", "bad", str(error), "fix the study file")
         return
-    if study.file.stimulus is None or study.space.constraints:
+    if study.space.mechanics is not None or study.space.constraints:
         yield _feasible(study)
     yield _step(study)
 
@@ -275,9 +275,10 @@ def _stimulus(file: Any) -> Iterator[Check]:
     words += f"; values may be off by {off}" if off else ""
     stated = "stimulus" in json.loads(file.content)
     yield _check("stimulus", words, not stated and "say so in a table [stimulus]", "note")
-    left = [key for key in ("title", "hello", "feel_reference", "feel_test") if key not in file.session.texts]
-    words = f"{len(left)} speak of feeling a device: {', '.join(left)}" if left else "the study's own"
-    yield _check("participants' texts", words, bool(left) and "write your own in [session.texts]", "note")
+    if file.space.mechanics is None:
+        left = [key for key in ("title", "hello", "feel_reference", "feel_test") if key not in file.session.texts]
+        words = f"{len(left)} speak of feeling a device: {', '.join(left)}" if left else "the study's own"
+        yield _check("participants' texts", words, bool(left) and "write your own in [session.texts]", "note")
     number = file.session.protocol_number
     fix = "write [session] protocol_number, so that it is compared with what people agreed to"
     yield _check("protocol number", number or "the study names none", not number and fix, "note")
@@ -295,7 +296,7 @@ def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator
     if study.stimulus is not None and study.stimulus.by == "person":
         raise InputError(f"{path}: a person presents, and no program; leave --stimulus out, and try a --dry-run.")
     if study.stimulus is None:
-        raise InputError(f"{path}: has a [renderer], a device renders, and no program presents; leave --stimulus out.")
+        raise InputError(f"{path}: has a [renderer] and no [stimulus], so that a device renders; leave --stimulus out.")
     place = serve.bound(port)
     check = StimulusCheck(study, patience)
 

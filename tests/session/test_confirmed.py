@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import hypothesis.strategies as st
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from live import CHOOSER, RAW, SETS, beginning, header
@@ -11,6 +12,7 @@ from partly import partly
 
 from hilbo import Study
 from hilbo.errors import InputError
+from hilbo.search.rendering import Rendering
 from hilbo.session.choose.choice import Answers
 from hilbo.session.export.psych_ds import psych_ds
 from hilbo.session.export.tables import sets_table, trials_table, validation_table
@@ -87,7 +89,7 @@ def test_what_is_no_confirmation_is_refused(values):
 
 @given(st.floats(-0.01, 1.01), st.floats(-0.01, 1.01))
 def test_what_counts_is_never_outside_the_ranges_and_nothing_else_is_changed(u, v):
-    confirmed = counted(STUDY.file, {"u": u, "v": v})
+    confirmed = counted(STUDY.file, {"u": u, "v": v}, {"u": u, "v": v})
     assert all(0.0 <= x <= 1.0 for x in confirmed.values())
     assert all(confirmed[n] == x for n, x in (("u", u), ("v", v)) if 0.0 <= x <= 1.0)
 
@@ -158,12 +160,32 @@ def test_a_bad_table_is_refused_in_one_sentence(table, words):
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_device_and_a_program_do_not_both_present():
-    fosls = {n: {"low": 0.1, "high": 0.9} for n in ("K1", "B1", "alpha")}
-    raw = RAW | {"parameters": fosls, "renderer": {"K_eff": 0.44, "damping": 0.95}}
-    assert Study.from_dict(raw).file.stimulus is None and Study.from_dict(RAW).file.stimulus is not None
-    with pytest.raises(InputError, match="a study has one"):
-        Study.from_dict(raw | {"stimulus": {}})
+FOSLS = RAW | {
+    "parameters": {n: {"low": 0.1, "high": 0.9} for n in ("K1", "B1", "alpha")},
+    "renderer": {"K_eff": 0.44, "damping": 0.95},
+}
+
+
+def test_a_program_renders_the_fosls_where_the_study_says_so():
+    assert Study.from_dict(FOSLS).file.stimulus is None and Study.from_dict(RAW).file.stimulus is not None
+    study = Study.from_dict(FOSLS | {"stimulus": {}})
+    assert study.file.stimulus.role == "stimulus" and study.file.meaning != Study.from_dict(FOSLS).file.meaning
+    with pytest.raises(InputError, match="nobody renders a force by hand"):
+        Study.from_dict(FOSLS | {"stimulus": {"by": "person", "within": 60.0, "silence": 10.0}})
+
+
+def test_K0_is_sent_need_not_be_confirmed_and_counts_as_sent():
+    study = Study.from_dict(FOSLS | {"stimulus": {"tolerance": {"K1": 0.01}}})
+    asked = Rendering.at(study.space, np.array([0.4, 0.6, 0.3])).parameters
+    assert list(asked) == ["K1", "B1", "alpha", "K0"]
+    own = {name: asked[name] for name in study.space.names}
+    for values in (asked, own, asked | {"K0": asked["K0"] * (1 + 6e-8)}):
+        check_confirmed(study.file, asked, values)
+        assert counted(study.file, asked, values) == asked
+    assert counted(study.file, asked, own | {"K1": asked["K1"] + 0.005}) == asked | {"K1": asked["K1"] + 0.005}
+    for wrong in (asked["K0"] * 1.001, float("nan")):
+        with pytest.raises(RefusedError, match="K0 is confirmed as"):
+            check_confirmed(study.file, asked, asked | {"K0": wrong})
 
 
 def compared(study, off):

@@ -13,14 +13,20 @@ from hilbo.study.file.reading import StudyFile
 
 __all__ = ["check_confirmed", "counted", "in_numbers", "in_words"]
 
+_EXACT = 1e-6  # relative error of K0; a 32-bit number keeps more
+
 
 def check_confirmed(study: StudyFile, asked: Mapping[str, float], values: Mapping[str, float] | None) -> None:
     """Raise RefusedError if `values` do not confirm the values `asked` (physical units, by name): with the code
-    "bad-answer" if a number is missing or not finite, "off" if one is beyond the study's tolerance."""
+    "bad-answer" if a number is missing or not finite, "off" if one is beyond the study's tolerance. Of a study with
+    [renderer] K0 need not be confirmed."""
     names = study.space.names
-    if values is None or set(values) != set(names):
+    if values is None or set(values) - _derived(study) != set(names):
         raise RefusedError("bad-answer", f"a confirmation has a value for {', '.join(names)}, and for nothing else.")
     assert study.stimulus is not None  # whoever asks has looked
+    for name in _derived(study) & set(values):
+        if not abs(values[name] - asked[name]) <= _EXACT * abs(asked[name]):
+            raise RefusedError("off", f"{name} is confirmed as {values[name]:g}, and {asked[name]:g} was asked for.")
     for parameter in study.space.parameters:
         value, wanted = values[parameter.name], asked[parameter.name]
         most = study.stimulus.off_by(parameter, wanted)
@@ -67,8 +73,14 @@ def _number(study: StudyFile, name: str, value: float | str) -> float:
     return number
 
 
-def counted(study: StudyFile, values: Mapping[str, float]) -> dict[str, float]:
-    """The values that count for an accepted confirmation: limited to the parameters' ranges, and rounded for discrete
-    ones."""
+def counted(study: StudyFile, asked: Mapping[str, float], values: Mapping[str, float]) -> dict[str, float]:
+    """The values that count for an accepted confirmation of the values `asked`: limited to the parameters' ranges, and
+    rounded for discrete ones; K0 as asked."""
     inside = {p.name: min(max(float(values[p.name]), p.low), p.high) for p in study.space.parameters}
-    return {p.name: float(round(inside[p.name])) if p.discrete else inside[p.name] for p in study.space.parameters}
+    counts = {p.name: float(round(inside[p.name])) if p.discrete else inside[p.name] for p in study.space.parameters}
+    return {name: asked[name] for name in _derived(study)} | counts
+
+
+def _derived(study: StudyFile) -> set[str]:
+    """Names of the values that the mechanics of a renderer derive from the parameters."""
+    return set() if study.space.mechanics is None else {"K0"}

@@ -40,7 +40,8 @@ def _sent(state, event):
     state = state.with_trial(trial.id, sent={**trial.sent, side: event.data})
     if state.study.stimulus is None:
         return state
-    values = counted(study_of(state.study, state.header.blocks[trial.block].material), event.data["values"])
+    study = study_of(state.study, state.header.blocks[trial.block].material)
+    values = counted(study, trial.renderings[side], event.data["values"])
     return state.with_trial(trial.id, confirmed={**trial.confirmed, side: values})
 
 

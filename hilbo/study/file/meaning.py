@@ -38,10 +38,11 @@ def meaning_part(tables: Content) -> Content:
     part: Content = {
         "order of the parameters": list(tables["parameters"]),
         "parameters": {name: _without(table, FREE["parameters"]) for name, table in tables["parameters"].items()},
-        "stimulus": _without(tables.get("stimulus", {}), FREE["stimulus"]),
         "session.labels": {k: v for k, v in labels.items() if v != own.labels.get(k, k.capitalize())},
         "session.definitions": {k: v for k, v in definitions.items() if v != own.definitions.get(k, "")},
     }
+    if "stimulus" in tables or "renderer" not in tables:  # else a device renders
+        part["stimulus"] = {"by": "program"} | _without(tables.get("stimulus", {}), FREE["stimulus"])
     for name, text in session.get("texts", {}).items():
         if f"session.texts.{name}" in MEANING and text != own.texts[name]:
             part[f"session.texts.{name}"] = text

@@ -196,7 +196,7 @@ def _file(raw: Mapping[str, Any], source: str) -> StudyFile:
         report=tables.report,
         validation=tables.validation,
         plan=tables.plan,
-        stimulus=None if tables.renderer is not None else tables.stimulus or StimulusTable(),
+        stimulus=tables.stimulus or (StimulusTable() if tables.renderer is None else None),
         simulation=tables.simulation,
         random_effect=None if tables.random_effect is None else tables.random_effect.column,
         materials=tuple(tables.materials),

@@ -93,7 +93,7 @@ NO_DELAY = 0.0
 
 
 class RendererTable(_Table, frozen=True):
-    """[renderer]: mechanical model of the hilbo device's rendering."""
+    """[renderer]: mechanical model of the rendering, by hilbo's device or, beside [stimulus], by a program."""
 
     K_eff: Annotated[_NotNegative, msgspec.Meta(examples=["0.44"])]
     damping: Annotated[_Positive, msgspec.Meta(examples=["0.95"])]
