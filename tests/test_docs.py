@@ -187,7 +187,40 @@ def test_the_first_study_begins_as_its_page_says(tmp_path):
     quick = [step for step in made.STEPS if step.command.split()[1] in ("init", "plan")]
     assert len(quick) == 2
     for step in quick:
-        assert made.section(step, tmp_path) in text, "run python docs/site/first_study.py"
+        assert made.section(step, tmp_path, made.FIGURES) in text, "run python docs/site/first_study.py"
+
+
+def _skeleton(command):
+    """A command without its numbers and ids."""
+    return re.sub(r"\d+(\.\d+)?", "0", re.sub(r"\b([A-Z])\d\d(,\1\d\d)*", r"\1", command))
+
+
+def test_the_haptic_study_is_that_of_its_script():
+    """The commands, words and figures; the script runs all of them."""
+    made, text = script("haptic_study"), (DOCS / "guides" / "haptic-study.md").read_text(encoding="utf-8")
+    steps = made.steps(made.FULL, made.LAB)
+    commands = re.findall(r"^```\n(hilbo .*)\n```", text, re.M)
+    assert [c for c in commands if "--device PORT" not in c] == [step.command for step in steps if step.command]
+    for step in steps:
+        assert step.words in text
+        for name, caption in step.figures:
+            figure = name.replace("/", "-")
+            assert f"![{caption}](haptic-study/{figure})" in text and (made.FIGURES / figure).is_file()
+    assert not re.search(r"/(tmp|root|home|work)/", text)
+
+
+@pytest.mark.deep
+def test_a_small_haptic_study_runs_by_the_commands_of_its_page(tmp_path):
+    """Two people for each material, from the device to the report."""
+    made, text = script("haptic_study"), (DOCS / "guides" / "haptic-study.md").read_text(encoding="utf-8")
+    small = made.steps(made.SMALL, made.LAB)
+    commands = [c for c in re.findall(r"^```\n(hilbo .*)\n```", text, re.M) if "--device PORT" not in c]
+    assert [_skeleton(c) for c in commands] == [_skeleton(step.command) for step in small if step.command]
+    made.page(made.SMALL, made.LAB, tmp_path, tmp_path / "figures")
+    report = json.loads((tmp_path / "report" / "result.json").read_text(encoding="utf-8"))
+    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    assert list(report["materials"]) == ["foam", "medium", "stiff"]
+    assert page.count("Nothing departs from the plan") == 3
 
 
 def test_the_data_dictionary_is_that_of_the_code():

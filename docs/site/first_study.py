@@ -1,33 +1,12 @@
-"""A whole study without a device, command by command: `python docs/site/first_study.py` runs it and writes the page.
+"""A whole study without a device, command by command: `python docs/site/first_study.py` runs it and writes the page."""
 
-What stands there is what the commands said, less times and what is of this machine alone; the figures are theirs.
-"""
-
-import os
-import re
-import shlex
-import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
 
-from PIL import Image
+from steps import Step, copied, section
 
 PAGE = Path(__file__).parents[1] / "guides" / "first-study.md"
 FIGURES = PAGE.parent / "first-study"
-
-
-class Step(NamedTuple):
-    """Words, a command, which of its lines are shown (a pattern), files shown whole, and figures with captions."""
-
-    words: str
-    command: str
-    shown: str = r".*"
-    files: tuple[str, ...] = ()
-    figures: tuple[tuple[str, str], ...] = ()
-
 
 STEPS = (
     Step(
@@ -99,6 +78,13 @@ cp simulated/trials.csv plan.json study
 Eight people are few: two halves of them need not agree on the optimum, and the dashed line of the first figure
 says how far they are apart.""",
         "hilbo report study --out report",
+        before=copied(
+            {
+                "colour.toml": "study/study.toml",
+                "simulated/trials.csv": "study/trials.csv",
+                "plan.json": "study/plan.json",
+            }
+        ),
         figures=(
             (
                 "report/population-convergence.png",
@@ -110,43 +96,6 @@ says how far they are apart.""",
 )
 
 
-def run(step: Step, folder: Path) -> str:
-    """What a command says, of its lines those that are shown."""
-    if "report study" in step.command:
-        (folder / "study").mkdir()
-        for source, name in (
-            ("colour.toml", "study.toml"),
-            ("simulated/trials.csv", "trials.csv"),
-            ("plan.json", "plan.json"),
-        ):
-            shutil.copy(folder / source, folder / "study" / name)
-    _, *words = shlex.split(step.command)
-    command = [Path(sys.executable).with_name("hilbo"), *words]
-    env = os.environ | {"COLUMNS": "120", "NO_COLOR": "1"}
-    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"{step.command}: exit code {done.returncode}\n{done.stderr}")
-    lines = (done.stderr + done.stdout).splitlines()
-    kept = [line for line in lines if re.match(step.shown, line) and not re.match(r"done in|\d+ of \d+ studies", line)]
-    return "\n".join(kept)
-
-
-def section(step: Step, folder: Path) -> str:
-    """A step's part of the page; its figures are copied with few colours, which is smaller."""
-    said = run(step, folder)
-    parts = [step.words, f"```\n{step.command}\n```"]
-    parts += [f"```text\n{said}\n```"] if said else []
-    for name in step.files:
-        kind = "toml" if name.endswith(".toml") else "markdown"
-        parts.append(f"`{name}`:\n\n```{kind}\n{(folder / name).read_text(encoding='utf-8').strip()}\n```")
-    for name, caption in step.figures:
-        figure = name.replace("/", "-")
-        image = Image.open(folder / name).convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE)
-        image.save(FIGURES / figure, optimize=True)
-        parts.append(f"![{caption}](first-study/{figure})\n\n*{caption}*")
-    return "\n\n".join(parts)
-
-
 def page() -> str:
     """The page as Markdown; runs everything, which takes minutes."""
     head = """# A first study, from beginning to end
@@ -156,7 +105,7 @@ is made by `python docs/site/first_study.py`, which runs the commands. In your o
 people; everything else stays."""
     FIGURES.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        return "\n\n".join([head, *(section(step, Path(folder)) for step in STEPS)]) + "\n"
+        return "\n\n".join([head, *(section(step, Path(folder), FIGURES) for step in STEPS)]) + "\n"
 
 
 if __name__ == "__main__":

@@ -91,7 +91,7 @@ def aggregate(
             folder = held.enter_context(results(out, force)) if team.writes else None
             chosen, cohort, flagged = read_cohort(trials, study, material, say)
             cohort = _chosen(cohort, participants) if participants else cohort
-            cohort, left_out = _included(chosen, cohort)  # by the study's own model, whatever --rule aggregates
+            cohort, left_out = _included(chosen, cohort, say)  # by the study's own model, whatever --rule aggregates
             left_out = [*flagged, *left_out]
             chosen = chosen if rule is None else by_rule(chosen, rule)
             cohort = cohort.first(first) if first else cohort
@@ -129,7 +129,7 @@ def robustness(
     """
     with results(out, force) as folder, progress() as say:
         chosen, everybody, flagged = read_cohort(trials, study, material, say)
-        cohort, left_out = _included(chosen, everybody)
+        cohort, left_out = _included(chosen, everybody, say)
         from hilbo.report.robustness import gp_table, write_robustness
         from hilbo.study.analysis import pilot as pilots
         from hilbo.study.analysis.robustness import robustness as check
@@ -141,7 +141,7 @@ def robustness(
         sure = pilots.pilot(chosen, cohort, comparison.hyperparameters, say) if pilot else None
         say("maps, figures and report")
         content = write_robustness(chosen, cohort, comparison, folder, seed, [*flagged, *left_out], sure)
-    finish(content, out, as_json)
+    finish(content, out, as_json, say.printed)
     if pilot and not as_json:
         print(gp_table(content))
 
@@ -191,9 +191,9 @@ def _chosen(cohort: Any, participants: str) -> Any:
     return some.of([name for name in cohort.names if name in set(some.names)])
 
 
-def _included(study, everybody) -> tuple[Any, list[str]]:
+def _included(study, everybody, say: Say) -> tuple[Any, list[str]]:
     """The cohort without the participants whom the study's rule of exclusion leaves out, and sentences on them, which
-    are also printed on stderr. Raises `InputError` if none is left."""
+    are also printed on stderr, and noted as printed in `say`. Raises `InputError` if none is left."""
     if not study.file.exclude:
         return everybody, []
     from hilbo.study.exclusion import exclusion_sentences, included
@@ -202,6 +202,7 @@ def _included(study, everybody) -> tuple[Any, list[str]]:
     sentences = exclusion_sentences(study, left_out)
     for sentence in sentences:
         remark(sentence)
+    say.printed += sentences
     return cohort, sentences
 
 

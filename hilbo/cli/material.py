@@ -19,7 +19,9 @@ Memory = Annotated[str, typer.Option(help='"short" (N samples) or "full".')]
 def identify(
     table: Annotated[Path, typer.Argument(help="Creep and relaxation tests (CSV or Parquet).", show_default=False)],
     out: Out,
-    material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
+    material: Annotated[
+        str | None, typer.Option(help="Which of the table's materials; the name of one that is not named there.")
+    ] = None,
     taps: Taps = 101,
     period: Period = 1e-3,
     memory: Memory = "short",

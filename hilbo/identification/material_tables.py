@@ -67,16 +67,17 @@ def read_material(
 ) -> Material:
     """Read the tests of one material from a CSV or Parquet file, in s, mm, N, Pa (or N/mm) and 1/Pa (or mm/N).
 
-    `material`: name, needed if the table has several; `begin`: state before the first row, "rest" or "equilibrium"
-    (`fitting.Test`); `only`: kind of test to read; `longest`: read the rows up to this time (s). Raises `InputError`
-    for a file that cannot be read, a column or value that is not valid, and a test that is not there or not usable.
+    `material`: name, needed if the table has several, without effect in one that names none; `begin`: state before the
+    first row, "rest" or "equilibrium" (`fitting.Test`); `only`: kind of test to read; `longest`: read the rows up to
+    this time (s). Raises `InputError` for a file that cannot be read, a column or value that is not valid, and a test
+    that is not there or not usable.
     """
     source = str(path)
     text = read_cells(path, "a material table needs a header with units and the samples of a test")
     columns, units = _columns(text, source)
     if text.empty:
         raise InputError(f"{source}: has no rows; a material table needs the samples of at least one test.")
-    text = of_material(text, material, source)
+    text = of_material(text, material if "material" in text else None, source)
     values = pd.DataFrame(
         {
             q: numbers(text, c, source, "a finite number", lambda v: v == v) * _UNITS[q][units[q]]

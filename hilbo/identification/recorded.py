@@ -12,6 +12,7 @@ __all__ = [
     "damping_radius",
     "interpolated",
     "local_line",
+    "lost_contact",
     "position_driven",
     "secant",
     "transform_length",
@@ -19,6 +20,7 @@ __all__ = [
 ]
 
 AROUND = 3  # half-width (rows) of the local line
+_GAP = 5.0  # median time steps, above which a step is a gap
 
 
 def local_line(values: Float[np.ndarray, "R m"], chosen: Bool[np.ndarray, " m"]) -> Float[np.ndarray, "R m"]:
@@ -44,9 +46,24 @@ def _force_and_position(test: Test) -> tuple[Any, Any]:
 
 
 def position_driven(test: Test) -> Test:
-    """The same recording as a relaxation test, with position as its input and force as its output."""
+    """The same recording as a relaxation test, with position as its input and force as its output. It ends where
+    contact was lost: from there on the position is not that of the material's surface."""
     force, position = _force_and_position(test)
-    return Test("relaxation", test.time, force, position, test.start)
+    lost = lost_contact(test)
+    rows = slice(None) if lost is None else slice(lost)
+    return Test("relaxation", test.time[rows], force[:, rows], position[:, rows], test.start)
+
+
+def lost_contact(test: Test) -> int | None:
+    """Index of the first row without contact before the first gap in the rows of a test in which the force is 0, as
+    `hilbo.identification.motor.pressing` leaves one out; None without such a gap."""
+    force, step = _force_and_position(test)[0], np.diff(test.time)
+    none = np.all(force == 0, axis=0)
+    gaps = np.flatnonzero((step > _GAP * np.median(step)) & none[:-1] & none[1:])
+    if gaps.size == 0:
+        return None
+    touched = np.flatnonzero(~none[: gaps[0]])
+    return int(touched[-1]) + 1 if touched.size else None
 
 
 def interpolated(

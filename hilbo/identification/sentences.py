@@ -8,8 +8,10 @@ import numpy as np
 from hilbo.identification.beginnings import untared
 from hilbo.identification.estimates import Estimate
 from hilbo.identification.fitting import Fit, Test
+from hilbo.identification.instrument import is_fitted_in_force
 from hilbo.identification.intervals import FEWEST_REPEATS, Intervals, Spread
 from hilbo.identification.misfit import coarse_kinds, moved_between_rows
+from hilbo.identification.recorded import lost_contact
 from hilbo.identification.residual_noise import DRIFTS
 
 __all__ = ["recording", "sentences"]
@@ -124,6 +126,12 @@ def recording(test: Test, T: float) -> Iterator[str]:
             f"The {test.kind} test has no rows from {time[i]:g} s to {time[i + 1]:g} s, where its input changes by"
             f" {change[i] / np.ptp(applied):.0%} of its range: a straight line was taken there, and values and"
             " intervals are wrong if the input went another way; record that part with rows as close as elsewhere."
+        )
+    lost = lost_contact(test)
+    if lost is not None and is_fitted_in_force(test):
+        yield (
+            f"The handle left the material at {time[lost]:g} s of the {test.kind} test: the rows from there on are not"
+            " fitted, because the position is not that of its surface; a smaller change of the force keeps contact."
         )
     offset = untared(applied, measured) if test.start == "rest" else None
     if offset is not None and _above_scatter(test.input if offset == "input" else test.output):

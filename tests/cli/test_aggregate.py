@@ -1,6 +1,7 @@
 """Whose answers, and which material's, `hilbo aggregate` takes from a table."""
 
 import contextlib
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
@@ -72,10 +73,11 @@ def test_whom_the_study_leaves_out_is_not_aggregated(capsys):
     study = Study.from_dict(PLAIN | {"study": PLAIN["study"] | {"exclude": "trials < 2"}})
     rows = {"participant": ["A", "B", "B", "B"], "trial": [1, 1, 2, 3], "response": "similar", "u": 0.5, "v": 15.0}
     cohort = cohort_of(pd.DataFrame(rows), study)
-    kept, sentences = _included(study, cohort)
+    say = SimpleNamespace(printed=[])
+    kept, sentences = _included(study, cohort, say)
     assert kept.names == ("B",) and sentences == ['[study] exclude = "trials < 2" leaves out 1: A (trials is 1).']
     assert sentences[0] in capsys.readouterr().err
-    assert _included(plain(), cohort) == (cohort, [])
+    assert say.printed == sentences and _included(plain(), cohort, say) == (cohort, [])
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,9 @@ from partly import partly
 
 from hilbo.identification import characterise
 from hilbo.identification.fitting import Curve, Fit, Test
+from hilbo.identification.instrument import is_fitted_in_force
 from hilbo.identification.material_tables import read_material
+from hilbo.identification.recorded import lost_contact, position_driven
 from hilbo.identification.sampled import Sampled
 from hilbo.identification.sentences import recording
 
@@ -91,6 +93,23 @@ def test_copies_tell_nothing_about_noise(monkeypatch, apart, ratio):
 
 
 @pytest.mark.deep
+def test_a_creep_test_that_is_fitted_in_its_force_ends_where_contact_was_lost():
+    """There the position is not that of the surface; other gaps, and contact, end nothing."""
+    _, creep = foam_tests(2, hold=0.5)
+    off = slice(560, 700)
+    force = creep.input + 0.01 * np.random.default_rng(0).standard_normal(creep.input.shape)
+    force[:, off] = 0.0
+    lost = without(Test("creep", creep.time, creep.output, force), slice(562, 698))
+    assert lost_contact(lost) == 560 and is_fitted_in_force(lost)
+    driven = position_driven(lost)
+    np.testing.assert_array_equal(driven.output, force[:, :560])
+    np.testing.assert_array_equal(driven.time, creep.time[:560])
+    assert "The handle left the material at 0.56 s of the creep test" in said(lost)
+    touching = without(Test("creep", creep.time, creep.output, creep.input + 0.1), slice(562, 698))
+    assert lost_contact(touching) is None and lost_contact(creep) is None
+    assert position_driven(touching).time.size == touching.time.size
+
+
 def test_characterise_says_it():
     relaxation = shifted(without(foam_tests(2, noise=0.004, hold=0.5)[0], slice(1, 100)), F=0.3)
     words = " ".join(characterise.characterise([relaxation], Sampled()).warnings)

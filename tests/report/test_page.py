@@ -118,6 +118,7 @@ def robust(nrmse, resampled=MappingProxyType({"median": 0.02, "95 %": 0.025}), s
             {"participant": "A", "nrmse": 0.01, "flagged": False},
             {"participant": "B", "nrmse": 0.2, "flagged": True},
         ],
+        "pilot": None,
         "learned": learned,
         "sensitivity": sensitivity,
         "versions": VERSIONS,

@@ -141,7 +141,7 @@ def test_the_page_is_whole_and_needs_nothing_else(written):
     assert "<any & all>" not in text and "&lt;any &amp; all&gt;" in text
     assert len(page.images) == {1: 3, 2: 4, 4: 5}[study.space.dim]
     assert all(image["alt"] and image["src"].startswith("data:image/png;base64,") for image in page.images)
-    assert page.captions == 4 and page.heads > 10
+    assert page.captions == 3 and page.heads > 10
     assert "://" not in text and "<script" not in text and "nan" not in text.lower().replace("base64", "")[:2000]
     assert ("truth" in text) == ("truth" in content)
     assert study.file.hash in text and content["versions"]["jax"] in text
@@ -150,7 +150,7 @@ def test_the_page_is_whole_and_needs_nothing_else(written):
 @pytest.mark.parametrize(
     ("rule", "definition"),
     [
-        ("bcm", "this is the maximum of the population map."),
+        ("bcm", "the optimum is the maximum of the population map."),
         ("learnt-1", 'The optimum is the point with the largest probability that a new participant answers "good".'),
         (
             "learnt-2",
