@@ -147,7 +147,7 @@ On this page simulated people answer:""",
         ),
         Step(
             """The printed table could take the place of `[gp]`. Its intervals hold the paper's values, which stay. In
-simulated studies [a pilot's hyperparameters gained nothing](../methods/aggregation.md#robustness-to-the-hyperparameters).
+simulated studies [a pilot's values gained nothing](../methods/aggregation.md#robustness-to-the-hyperparameters).
 The [recommended rule](../methods/which_method.md) learns them from the study itself, and needs no pilot.""",
             "hilbo robustness pilot-logs --study haptic.toml --material foam --pilot --out pilot > gp.toml",
             r"hilbo:",

@@ -35,7 +35,7 @@ from hilbo.study.analysis.region import Region, region_content, region_sentences
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import MANY, Aggregate, asked_variance, other_inference
 from hilbo.study.estimate.learnt import effect_content, learnt_content, learnt_sentences
-from hilbo.study.estimate.location import location_notes, location_sentences
+from hilbo.study.estimate.location import goal_sentences, location_notes, location_sentences
 from hilbo.study.estimate.optimum import Optimum
 from hilbo.study.formats.json_file import Content
 from hilbo.study.results.map_netcdf import CELLS, map_dataset, on_grid, write_map
@@ -133,6 +133,7 @@ def result(
     if other in aggregate.alternatives:
         content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
     warnings = [*left_out, *_not_converged(people), *rule_warnings(study, aggregate), *learnt_sentences(study)]
+    warnings += goal_sentences(study, aggregate.cohort.trials)
     warnings += location_sentences(study, best.x, best.sd, aggregate.asked_variance)
     content["warnings"] = warnings + region_sentences(region, study.one_optimum) + check_sentences(check)
     content["optimum_region"] = region_content(study, region)

@@ -143,6 +143,7 @@ def test_nobody_is_given_a_row_to_validate_a_map_that_they_are_in(hilbo, tmp_pat
     before = (tmp_path / "plan.json").read_bytes()
     for arguments, sentence in (
         (("V02=P01", "--from", "result.json"), '"P01" is in the map that is to be validated'),
+        (("V02=P1", "--from", "result.json"), '"P1" is in the map that is to be validated, as "P01"'),
         (("V02=V03",), "add --from result.json, of which its sets are made, so that V03 can be looked for there"),
         (("V02=V03", "--from", "none.json"), "none.json: cannot be read"),
     ):

@@ -2,12 +2,13 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from studies import PLAIN
+from studies import PLAIN, answered, plain_study
 
 from hilbo.study.config import Study
-from hilbo.study.estimate.location import location_notes, location_sentences, truth_sentence
+from hilbo.study.estimate.location import goal_sentences, location_notes, location_sentences, truth_sentence
 
 STUDY = Study.load("hilbo/data/paper.toml")
 SD, ASKED = jnp.asarray(0.3), jnp.asarray(0.25)
@@ -63,6 +64,15 @@ def test_an_extrapolation_is_called_one():
     assert "there, 0.9, is larger than wherever somebody answered (0.5 at most)" in sentence
     assert location_sentences(STUDY, x, jnp.asarray(0.9), None) == []
     assert location_sentences(STUDY, x, jnp.asarray(0.5), ASKED) == []
+
+
+def test_a_goal_that_nobody_answered_is_named():
+    study = plain_study(2)
+    cohort = answered(study)
+    assert goal_sentences(study, cohort.trials) == []
+    others = eqx.tree_at(lambda t: t.mask, cohort.trials, cohort.trials.mask & (cohort.trials.q == 0))
+    (sentence,) = goal_sentences(study, others)
+    assert sentence.startswith('Nobody answered "good"')
 
 
 def test_a_row_of_a_table_has_the_same_in_a_few_words():

@@ -79,7 +79,7 @@ def test_trials_that_count_through_phases_stay_in_their_order(tmp_path):
     assert table["phase"].tolist() == ["adaptive", "adaptive", "space filling"] and table["trial"].tolist() == [1, 2, 1]
 
 
-@pytest.mark.filterwarnings("ignore:.*differ in capitals only")
+@pytest.mark.filterwarnings("ignore:.*differ in capitals", "ignore:.*rounded")
 @pytest.mark.parametrize("names", [["P2", "P10", "P10b"], ["9", "010", "10", "1e3"], ["Ada", "Ben", "ada"]])
 def test_the_order_of_the_rows_makes_no_difference(tmp_path, names):
     phases, trials = ("first", "second"), range(1, 4)
@@ -99,6 +99,7 @@ def test_other_columns_are_kept_as_text(tmp_path):
     assert table["note"].tolist() == ["007", ""]
 
 
+@pytest.mark.filterwarnings("ignore:.*differ in capitals")
 def test_participants_named_like_missing_values_or_numbers_are_people(tmp_path):
     text = HEADER + "NA,1,close,1,2\n01,1,close,1,2\n1,1,close,1,2\nnull,1,close,1,2\n"
     assert read_trials(written(tmp_path, text), study())["participant"].tolist() == ["01", "1", "NA", "null"]
@@ -201,10 +202,17 @@ def test_columns_of_any_kind_of_float_are_read(dtype):
             cohort_of(frame.assign(gain=frame["gain"].where([True, False])), study())
 
 
-def test_ids_that_differ_in_capitals_only_are_two_people_with_a_warning(tmp_path):
-    rows = HEADER + "A,1,close,1,2\na,1,close,1,2\n"
-    with pytest.warns(InputRemark, match='participants "A" and "a" differ in capitals only'):
-        assert set(read_trials(written(tmp_path, rows), study())["participant"]) == {"A", "a"}
+@pytest.mark.parametrize("pair", [("A", "a"), ("1", "01"), ("7", "7.0"), ("P1", "P01")])
+def test_ids_that_may_be_one_person_are_two_with_a_warning(tmp_path, pair):
+    one, other = pair
+    rows = HEADER + f"{one},1,close,1,2\n{other},1,close,1,2\n"
+    with pytest.warns(InputRemark, match=f'participants "{one}" and "{other}" differ in capitals, blanks'):
+        assert set(read_trials(written(tmp_path, rows), study())["participant"]) == {one, other}
+
+
+def test_ids_that_a_spreadsheet_rounded_are_named(tmp_path):
+    with pytest.warns(InputRemark, match='participant "9.45E12" looks like a number that a spreadsheet has rounded'):
+        read_trials(written(tmp_path, HEADER + "9.45E12,1,close,1,2\nE12,1,close,1,2\n"), study())
 
 
 @pytest.mark.parametrize("labels", [("1.0", "1.5", "2.0"), ("0,0", "1,0", "2,0"), ("+1", "2e0", "three")])

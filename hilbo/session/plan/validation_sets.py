@@ -20,6 +20,7 @@ from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import aggregate_cohort
 from hilbo.study.estimate.learnt import resolved
+from hilbo.study.formats.cell_text import id_form
 from hilbo.study.formats.json_file import check_values
 from hilbo.study.results.result_json import FoundOptimum, Result
 
@@ -34,10 +35,13 @@ def check_participants(results: Iterable[Result], participants: Sequence[str], s
     """Raise InputError for a participant whose answers are in one of the materials' results although `source` is
     "aggregate", or in none of them although it is "individual"."""
     in_map = {person.participant for result in results for person in result.participants}
+    forms = {id_form(name): name for name in in_map}
     for person in participants:
-        if source == "aggregate" and person in in_map:
+        if source == "aggregate" and (known := forms.get(id_form(person))) is not None:
+            called = "" if person in in_map else f', as "{known}"'
             raise InputError(
-                f'plan: participant "{person}" is in the map that is to be validated; invite people who are not.'
+                f'plan: participant "{person}" is in the map that is to be validated{called}; invite people who are'
+                " not."
             )
         if source == "individual" and person not in in_map:
             raise InputError(

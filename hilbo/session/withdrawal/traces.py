@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hilbo.study.disk.lock import JOURNAL, LOCK
+from hilbo.study.formats.cell_text import id_form
 from hilbo.study.formats.parsing import UNREADABLE
 from hilbo.study.tables.parameter_sets import ROLES
 
@@ -98,20 +99,14 @@ def _sort_in(path: Path, inside: Path, below: Below) -> None:
 def same_id(text: str, participant: str) -> bool:
     """Whether two ids are equal apart from leading zeros, ".0", blanks, capitals and Unicode form, which spreadsheets
     and people change."""
-    return _form(text) == _form(participant)
-
-
-def _form(text: str) -> str:
-    """Normal form of an id for `same_id`: without blanks, leading zeros and ".0" after numbers; lower case, NFKC."""
-    text = re.sub(r"\s+", "", unicodedata.normalize("NFKC", text)).casefold()
-    return re.sub(r"(?<=\d)\.0+(?!\d)", "", re.sub(r"(?<![\d.])0+(?=\d)", "", text))
+    return id_form(text) == id_form(participant)
 
 
 def _id_pattern(participant: str, exact: bool) -> str:
     """Regular expression of an id: of exactly this text, or of all spellings that `same_id` accepts."""
     if exact:
         return re.escape(participant)
-    pieces = re.findall(r"\.\d+|\d+|.", _form(participant))
+    pieces = re.findall(r"\.\d+|\d+|.", id_form(participant))
     ways = [rf"0*{piece}(?:\.0+(?!\d))?" if piece[0].isdigit() else re.escape(piece) for piece in pieces]
     return "(?i:" + r"\s?".join(ways) + ")"
 
@@ -137,7 +132,7 @@ def spelled(text: str, suffix: str, participant: str, exact: bool = False) -> st
     match = re.search(rf"(?:(?<![\w.-])|(?<=\bown-)){way}(?![\w-]|\.\w)", text)
     if match is None:
         return ""
-    if not _form(participant).replace(".", "").isdigit():
+    if not id_form(participant).replace(".", "").isdigit():
         return match[0]
     names_set = rf"(?:individual:|\bown-){way}(?![\w.-])|(?<![\w.-]){way} (?:{'|'.join(ROLES)})\b"
     if match := re.search(names_set, text):

@@ -29,7 +29,7 @@ from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort
 from hilbo.study.estimate.learnt import learnt_sentences, resolved, that_learns
-from hilbo.study.estimate.location import location_sentences
+from hilbo.study.estimate.location import goal_sentences, location_sentences
 from hilbo.study.estimate.optimum import map_optimum
 from hilbo.study.exclusion import included
 from hilbo.study.formats.json_file import Content
@@ -102,7 +102,13 @@ def analyse(
     sets, sentences = _best_mid_worst(study, aggregate, seed)
     best = aggregate.optimum
     location = location_sentences(study, best.x, best.sd, aggregate.asked_variance)
-    limits = (*location, *learnt_sentences(study), *limits_of(study, cohort), *sentences)
+    limits = (
+        *goal_sentences(study, cohort.trials),
+        *location,
+        *learnt_sentences(study),
+        *limits_of(study, cohort),
+        *sentences,
+    )
     limits += (*_aggregated_otherwise(aggregate.map), *both.limits)
     return Analysis(
         population,

@@ -9,10 +9,11 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from hilbo.ordinal_gp import Trials
 from hilbo.search.linear import rows_of
 from hilbo.study.config import Study
 
-__all__ = ["location_notes", "location_sentences", "optimum_sentence", "truth_sentence"]
+__all__ = ["goal_sentences", "location_notes", "location_sentences", "optimum_sentence", "truth_sentence"]
 
 _AT = 1e-6  # of a range
 _BORDERS = {
@@ -50,6 +51,13 @@ def _rendering(study: Study, x: Float[ArrayLike, " d"]) -> str:
         f"{parameter.name} = {parameter.words(value)}{f' {parameter.unit}' if parameter.unit else ''}"
         for parameter, value in zip(study.space.parameters, values, strict=True)
     )
+
+
+def goal_sentences(study: Study, trials: Trials) -> list[str]:
+    """A warning if none of the responses is the goal; else an empty list. `trials`: those of the map, masked."""
+    if np.any((np.asarray(trials.q) == study.goal.category) & np.asarray(trials.mask)):
+        return []
+    return [f'Nobody answered "{study.goal_label}": where it is most probable is an extrapolation of the model.']
 
 
 def location_sentences(

@@ -8,6 +8,7 @@ unchanged: an escape character would make it another text. Plain numbers and lon
 """
 
 import re
+import unicodedata
 from collections.abc import Iterable
 
 from hilbo.errors import InputError
@@ -15,13 +16,16 @@ from hilbo.errors import InputError
 __all__ = [
     "FORMULA_WORDS",
     "ID_WORDS",
+    "alike",
     "but_for_case",
     "check_id",
     "check_text",
     "formulas",
+    "id_form",
     "invalid_ids",
     "is_decimal",
     "is_id",
+    "is_rounded",
     "runs_in_a_spreadsheet",
     "without_decimal_comma",
 ]
@@ -33,6 +37,7 @@ FORMULA_WORDS = (
     " letter or a digit"
 )
 _NUMERAL = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?")
+_ROUNDED = re.compile(r"\d([.,]\d+)?[eE]\+?\d+")
 _DASHES = "-+ \t\r\n"
 _BEGINS = ("=", "@", "+", "-", "\t", "\r", "\n", "＝", "＠", "＋", "－")  # noqa: RUF001 (some spreadsheets take these too)
 
@@ -60,6 +65,29 @@ def but_for_case(names: Iterable[str]) -> str:
         if other != name:
             return f'participants "{other}" and "{name}"'
     return ""
+
+
+def alike(names: Iterable[str]) -> str:
+    """The first pair of different ids that have the same `id_form`, as 'participants "1" and "01"'; "" if there is
+    none."""
+    first: dict[str, str] = {}
+    for name in names:
+        other = first.setdefault(id_form(name), name)
+        if other != name:
+            return f'participants "{other}" and "{name}"'
+    return ""
+
+
+def id_form(text: str) -> str:
+    """Normal form of an id: without what spreadsheets and people change, that is blanks, leading zeros of numbers and
+    ".0" after them; lower case, NFKC."""
+    text = re.sub(r"\s+", "", unicodedata.normalize("NFKC", text)).casefold()
+    return re.sub(r"(?<=\d)\.0+(?!\d)", "", re.sub(r"(?<![\d.])0+(?=\d)", "", text))
+
+
+def is_rounded(name: str) -> bool:
+    """Whether an id is a number with an exponent, as a spreadsheet shows long ones, such as 9.45E12."""
+    return _ROUNDED.fullmatch(name) is not None
 
 
 def runs_in_a_spreadsheet(text: str) -> bool:

@@ -20,7 +20,7 @@ import pandas as pd
 from hilbo.errors import InputError, warn_caller
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES, FlagCounts
-from hilbo.study.formats.cell_text import FORMULA_WORDS, ID_WORDS, but_for_case, check_text, formulas, invalid_ids
+from hilbo.study.formats.cell_text import FORMULA_WORDS, ID_WORDS, alike, check_text, formulas, invalid_ids, is_rounded
 from hilbo.study.formats.csv_file import (
     FRAME,
     answer_forms,
@@ -85,8 +85,9 @@ def trial_table(
 
     **Arguments:** `material`: select its rows; required if there are several. `source`: the file, for messages.
     `others`: keep the columns that hilbo does not use. `say`: called with the number of rows read so far. `note`:
-    called with one sentence on participants none of whose responses is fitted, and one on ids that differ in capitals
-    only; by default a warning. Raises `InputError`, and its subclass `NothingToFitError` if no row is left.
+    called with one sentence on each of: participants none of whose responses is fitted, two ids that may be one
+    participant's, ids that a spreadsheet has rounded; by default a warning. Raises `InputError`, and its subclass
+    `NothingToFitError` if no row is left.
     """
     texts, pieces, rows, named = {}, [], 0, {}
     for text in cells:
@@ -113,8 +114,7 @@ def trial_table(
         raise NothingToFitError(f"{source}: has no rows to fit; all are warm-up, repeated or voided{besides}.")
     table = of_material(table, material, source)
     _note_the_absent(left, table, source if material is None else f"{source} ({material})", besides, note)
-    if alike := but_for_case(table["participant"].unique()):
-        note(f"{source}: {alike} differ in capitals only; they are taken for two people.")
+    _note_doubtful_ids(list(table["participant"].unique()), source, note)
     return TrialTable(_ordered(table), counts)
 
 
@@ -148,6 +148,18 @@ def _note_the_absent(
         have = "has" if len(absent) == 1 else "have"
         also = f"voided, warm-up or repeated{besides}, and not fitted"
         note(f"{source}: {answers} {also}; {who} {have} no other answer in it.")
+
+
+def _note_doubtful_ids(names: list[str], source: str, note: Callable[[str], object]) -> None:
+    """Call `note` with a sentence on two ids that may be one participant, and on ids that may be several."""
+    if pair := alike(names):
+        words = 'capitals, blanks, leading zeros or ".0" only'
+        note(f"{source}: {pair} differ in {words}; they are taken for two people.")
+    if rounded := [name for name in names if is_rounded(name)]:
+        note(
+            f'{source}: participant "{rounded[0]}" looks like a number that a spreadsheet has rounded, and may be'
+            " several people; export the ids as text."
+        )
 
 
 def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
