@@ -15,13 +15,14 @@ from hilbo.session.log.records import RefusedError
 from hilbo.session.plan.participants import add_person, read_people
 from hilbo.session.plan.plan import make_plan
 from hilbo.study.cohort import read_trials
+from hilbo.study.formats.cell_text import is_id
 from hilbo.study.tables.parameter_sets import read_sets
 from hilbo.study.tables.validation import read_validation
 
 FORMULAS = ("=1+1", "@SUM(A1)", "+cmd", "-cmd|' /C calc'!A1", "\t=1+1", "=HYPERLINK(A1)", " =1+1")
 IN_ANOTHER_COUNTRY = ("a;=1+1", "a,@SUM(A1)", "a\t+cmd", 'a;"=1+1"', ";-cmd", "a;b;=1+1", "a\n=1+1")
 PLAIN = ("-3", "+1.5e-3", "-", "a=1", "P01", "3 - 4", "1,-2", "a; b, - c", "a;-")
-NO_IDS = (".", "..", "-x", "P 1", "../P1", "a/b", "é", "x" * 33, "=1+1")
+NO_IDS = (".", "..", "-x", "P 1", "../P1", "a/b", "é", "x" * 65, "=1+1", "NUL", "con.1", "Lpt1", "P01.")
 
 
 def trials(path, **changes):
@@ -81,6 +82,13 @@ def test_text_that_a_spreadsheet_would_run_is_refused(tmp_path, table, column):
         assert path.read_bytes() == content
     with pytest.raises(InputError, match="the name of a column"):
         read(make(tmp_path / "head.csv", **{"=1+1": "x"}))
+
+
+@pytest.mark.parametrize(
+    "person", ["x" * 64, "5f0c6d4e-9a1b-4c3d-8e7f-0123456789ab", "null", "com", "COM10", "P.1", "A"]
+)
+def test_these_are_ids(person):
+    assert is_id(person)
 
 
 @pytest.mark.parametrize("table", ["trials", "validation", "people", "added"])

@@ -30,8 +30,12 @@ __all__ = [
     "without_decimal_comma",
 ]
 
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
-ID_WORDS = 'an id has up to 32 letters, digits, "_", "-", ".", begins with a letter or digit, and is nobody\'s name'
+_ID = re.compile(r"[A-Za-z0-9]([A-Za-z0-9_.-]{0,62}[A-Za-z0-9_-])?")
+_RESERVED = re.compile(r"(?i:con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # by Windows, which keeps no file of this name
+ID_WORDS = (
+    'an id has up to 64 letters, digits, "_", "-", ".", begins with a letter or digit, does not end with ".", and is'
+    " neither somebody's name nor one that Windows reserves, such as NUL"
+)
 FORMULA_WORDS = (
     "which a spreadsheet would run as a formula; begin it, and what follows a comma, semicolon or tab in it, with a"
     " letter or a digit"
@@ -46,8 +50,9 @@ _ENDS = re.compile(r"[,;\t\r\n]")  # of cells: the separators of tables that hil
 
 
 def is_id(participant: str) -> bool:
-    """Whether this may be a participant's id: up to 32 letters, digits, "_", "-", ".", the first a letter or digit."""
-    return _ID.fullmatch(participant) is not None
+    """Whether this may be a participant's id: up to 64 letters, digits, "_", "-", ".", the first a letter or digit, the
+    last not "."; no reserved name of Windows."""
+    return _ID.fullmatch(participant) is not None and _RESERVED.fullmatch(participant) is None
 
 
 def check_id(participant: str, place: str) -> None:
