@@ -1,6 +1,7 @@
 """`hilbo report`: what it says of poor data and of the hypotheses, its tables, its figures and its page."""
 
 import json
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -35,7 +36,7 @@ from hilbo.study.estimate.aggregate import fit_cohort
 from hilbo.study.estimate.optimum import predict_people
 from hilbo.study.file.reserved_names import is_reserved
 from hilbo.study.folder import Reference
-from hilbo.study.results.arviz_groups import groups, predictive_shares, write_groups
+from hilbo.study.results.arviz_groups import groups, inference_data, predictive_shares, write_groups
 from hilbo.study.template import NewStudy, study_text
 
 
@@ -197,27 +198,23 @@ def test_tolerance_of_people_who_agree_does_not_depend_on_the_draw():
 def test_groups_are_what_arviz_reads(tmp_path):
     study, cohort = plain(), crowd([HILL[:6], HILL[:4]])
     posteriors = fit_cohort(study, cohort)
-    inference_data = groups(study, cohort, posteriors, draws=4000)
-    constants = inference_data["constant_data"]
+    made = groups(study, cohort, posteriors, draws=4000)
+    constants = made["constant_data"]
     own = {*constants.variables, *constants.dims} - {*study.space.names}
     assert all(is_reserved(name, study.responses, False) for name in own)
-    f = inference_data["posterior"]["f"].values[0]
+    f = made["posterior"]["f"].values[0]
     mean, variance = posteriors_at(posteriors)
-    np.testing.assert_allclose(f[:, 0].mean(axis=0), mean[0], atol=0.06)
-    np.testing.assert_allclose(f[:, 0].var(axis=0), variance[0], atol=0.06)
-    assert np.isnan(f[:, 1, 4:]).all() and (inference_data["observed_data"]["response"].values[1, 4:] == -1).all()
-    given = inference_data["log_likelihood"]["response"]
-    expected = jax.jit(jax.vmap(study.gp.likelihood.log_prob))(f[0, 1, :4], np.asarray(cohort.trials.q)[1, :4])
+    np.testing.assert_allclose(f[:, :6].mean(axis=0), mean[0, :6], atol=0.06)
+    np.testing.assert_allclose(f[:, :6].var(axis=0), variance[0, :6], atol=0.06)
+    assert all(group.sizes["obs_id"] == 10 for group in made.values())
+    given = made["log_likelihood"]["response"]
+    expected = jax.jit(jax.vmap(study.gp.likelihood.log_prob))(f[0, 6:], np.asarray(cohort.trials.q)[1, :4])
     np.testing.assert_allclose(given.values[0, 0, -4:], expected)
-    assert list(given["participant"].values[-5:]) == ["P0", *["P1"] * 4] and list(given["answer"].values[-4:]) == [
-        1,
-        2,
-        3,
-        4,
-    ]
-    observed, predicted = predictive_shares(inference_data, 3)
+    assert list(given["participant"].values[-5:]) == ["P0", *["P1"] * 4]
+    assert list(given["answer"].values[-4:]) == [1, 2, 3, 4]
+    observed, predicted = predictive_shares(made, 3)
     assert observed.sum() == pytest.approx(1.0) and predicted.shape == (4000, 3)
-    write_groups(inference_data, tmp_path / "inference.nc")
+    write_groups(made, tmp_path / "inference.nc")
     read = az.from_netcdf(tmp_path / "inference.nc", engine="h5netcdf")
     names = read.groups() if callable(read.groups) else [path.strip("/") for path in read.groups]  # ArviZ 0 or 1
     assert {"posterior", "posterior_predictive", "observed_data", "log_likelihood", "constant_data"} <= set(names)
@@ -225,8 +222,26 @@ def test_groups_are_what_arviz_reads(tmp_path):
         loo = az.loo(read)
     assert np.isfinite(getattr(loo, "elpd", None) or loo.elpd_loo)
     tree = xr.open_datatree(tmp_path / "inference.nc", engine="h5netcdf")
-    np.testing.assert_array_equal(tree["constant_data"]["u"].values[0], cohort.physical[0, :, 0])
+    np.testing.assert_array_equal(tree["constant_data"]["u"].values[:6], cohort.physical[0, :6, 0])
     tree.close()
+
+
+@pytest.mark.deep  # ArviZ's figures take seconds
+@pytest.mark.parametrize("plot", ["plot_ppc", "plot_loo_pit", "plot_separation", "plot_bpv", "summary", "plot_khat"])
+def test_arviz_draws_unequal_numbers_of_answers(plot):
+    study, cohort = plain(), crowd([HILL[:6], HILL[:4], HILL[:1]])
+    data = inference_data(study, cohort, fit_cohort(study, cohort), draws=100)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of few answers and of matplotlib
+        if plot == "plot_ppc":
+            (axes,) = np.ravel(az.plot_ppc(data, kind="cumulative", show=False))
+            assert min(np.min(line.get_xdata()) for line in axes.lines if len(line.get_xdata())) >= 0
+        elif plot == "plot_khat":
+            az.plot_khat(az.loo(data, pointwise=True))
+        elif plot == "summary":
+            assert len(az.summary(data)) == 11
+        else:
+            getattr(az, plot)(data, y="response") if plot != "plot_bpv" else az.plot_bpv(data)
 
 
 def test_answers_are_found_in_the_table_by_trial_and_session(tmp_path):
@@ -240,9 +255,9 @@ def test_answers_are_found_in_the_table_by_trial_and_session(tmp_path):
     write_groups(groups(study, cohort, fit_cohort(study, cohort), draws=2), tmp_path / "inference.nc")
     with xr.open_dataset(tmp_path / "inference.nc", group="constant_data", engine="h5netcdf") as constants:
         frame = constants[["trial", "session", "u"]].to_dataframe().reset_index()
-    joined = frame[frame["trial"] > 0].merge(table, on=["participant", "session", "trial"], validate="one_to_one")
+    joined = frame.merge(table, on=["participant", "session", "trial"], validate="one_to_one")
     assert len(joined) == 5 and (joined["u_x"] == joined["u_y"]).all()
-    assert list(frame["answer"]) == [1, 2, 3, 4, 5, 6] * 2 and (frame["trial"] == -1).sum() == 7
+    assert list(frame["answer"]) == [1, 2, 3, 1, 2]
     np.testing.assert_array_equal(cohort.rows(np.array([1])).numbers, [[4, 5, 0, 0, 0, 0]])
 
 

@@ -125,7 +125,7 @@ def test_a_persons_map_is_drawn_and_arviz_has_what_the_file_of_the_command_line_
         draw_map(STUDY, one, ("u", "w"))
     data = inference_data(STUDY, cohort, people, draws=3)
     assert data.groups() == ["posterior", "posterior_predictive", "log_likelihood", "observed_data", "constant_data"]
-    assert data.observed_data["response"].sizes == {"participant": 2, "answer": cohort.trials.capacity}
+    assert data.observed_data["response"].sizes == {"obs_id": int(cohort.counts().sum())}
 
 
 def test_what_cannot_be_predicted_is_one_sentence(one, people):

@@ -28,7 +28,7 @@ _OF_CSV = {
 }
 _OF_FILES = {
     "map.nc": ("mean", "variance", "feasible", "point"),
-    "inference.nc": ("thresholds", "edge", "noise", "answer"),
+    "inference.nc": ("thresholds", "edge", "noise", "answer", "obs_id"),
     "predicted": ("mean", "sd"),
 }
 _EVERYWHERE = frozenset((*TRIAL_COLUMNS, *_OF_CSV, *(name for names in _OF_FILES.values() for name in names)))

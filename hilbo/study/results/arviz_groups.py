@@ -1,29 +1,26 @@
 """A material's results for ArviZ: posterior, posterior predictive and observed responses as netCDF groups.
 
-Groups and variables (dimensions chain, draw, participant, answer; of log_likelihood chain, draw, obs_id):
+Groups and variables, all along the dimension obs_id, the fitted responses (draws also along chain and draw):
 
-    posterior             f: latent score at each participant's trials, drawn from N(mode, K - K C K)
-    posterior_predictive  response: predicted responses (categories from 0) at the same trials
-    log_likelihood        response: log P(response | f) without padding, with participant and answer of each, since
-                          `arviz.loo` counts every element as an observation
-    observed_data         response: the responses, -1 in unused slots
-    constant_data         one variable for each parameter, in its unit; thresholds and noise of the likelihood; trial
-                          (and session) of each response, as in the trial table
+    posterior             f: latent score, drawn from N(mode, K - K C K)
+    posterior_predictive  response: predicted responses (categories from 0)
+    log_likelihood        response: log P(response | f)
+    observed_data         response: the responses
+    constant_data         one variable for each parameter, in its unit; thresholds and noise of the likelihood
 
-`answer` counts each participant's fitted responses from 1. Voided, warm-up and repeated ones are not included, so that
-it is not the trial number: rows of the table are identified by `trial` and `session`. `arviz.from_netcdf` and
-`xarray.open_datatree` read the file. Each participant's posterior is separate, without pooling.
+Coordinates of obs_id: participant; answer, which counts each participant's fitted responses from 1; trial and session,
+as in the trial table, where the cohort has them. Voided, warm-up and repeated responses are not included.
+`arviz.from_netcdf` and `xarray.open_datatree` read the file. Each participant's posterior is separate, without pooling.
 """
 
 import os
-from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from hilbo.errors import InputError
 from hilbo.kernels import gram
@@ -36,42 +33,50 @@ from hilbo.study.config import Study
 
 __all__ = ["groups", "inference_data", "predictive_shares", "write_groups"]
 
-_DIMS = ("chain", "draw", "participant", "answer")
+_DIMS = ("chain", "draw", "obs_id")
 
 
 def groups(
     study: Study, cohort: Cohort, posteriors: Posterior, draws: int = 200, seed: int = 0
 ) -> dict[str, xr.Dataset]:
-    """The groups as datasets, by name. `draws`: number of independent draws, as one chain, from `seed`. Unused slots
-    are NaN, -1 or ""."""
+    """The groups as datasets, by name. `draws`: number of independent draws, as one chain, from `seed`."""
     keys = jax.random.split(jax.random.key(seed), len(cohort.names))
-    f, response, log_likelihood = (np.moveaxis(np.asarray(leaf), 0, 1)[None] for leaf in _draw(posteriors, keys, draws))
-    mask = np.asarray(cohort.trials.mask)
-    coords = {"participant": list(cohort.names), "answer": np.arange(1, mask.shape[1] + 1)}
+    drawn = (np.moveaxis(np.asarray(leaf), 0, 1)[None] for leaf in _draw(posteriors, keys, draws))
+    person, answer = np.nonzero(np.asarray(cohort.trials.mask))
+    f, response, log_likelihood = (values[..., person, answer] for values in drawn)
+    coords = _coordinates(cohort, person, answer)
     chains = coords | {"chain": [0], "draw": np.arange(draws)}
-    held = mask[None, None]
-    observed = np.where(mask, np.asarray(cohort.trials.q), -1)
     constants: dict[str, Any] = {
-        p.name: (_DIMS[2:], np.where(mask, cohort.physical[..., i], np.nan), _attributes(p))
+        p.name: ("obs_id", cohort.physical[person, answer, i], _attributes(p))
         for i, p in enumerate(study.space.parameters)
     }
     likelihood = jax.tree.map(lambda leaf: leaf[0], posteriors.gp).likelihood  # what a rule learnt, where it learns
     constants["thresholds"] = ("edge", np.asarray(likelihood.thresholds))
     constants["noise"] = ((), np.asarray(likelihood.noise))
-    if cohort.numbers is not None:
-        constants["trial"] = (_DIMS[2:], np.where(mask, cohort.numbers, -1), {"long_name": "trial of the table"})
-    if cohort.session is not None:
-        names_of = np.array(cohort.sessions, object)[cohort.session]
-        constants["session"] = (_DIMS[2:], np.where(mask, names_of, ""))
     names = ", ".join(f"{k} = {label}" for k, label in enumerate(study.responses))
     say = {"long_name": "answer", "categories": names}
+    observed = np.asarray(cohort.trials.q)[person, answer]
     return {
-        "posterior": xr.Dataset({"f": (_DIMS, np.where(held, f, np.nan), {"long_name": study.file.attribute})}, chains),
-        "posterior_predictive": xr.Dataset({"response": (_DIMS, np.where(held, response, -1), say)}, chains),
-        "log_likelihood": _of_answers(log_likelihood, mask, cohort.names),
-        "observed_data": xr.Dataset({"response": (_DIMS[2:], observed, say)}, coords),
+        "posterior": xr.Dataset({"f": (_DIMS, f, {"long_name": study.file.attribute})}, chains),
+        "posterior_predictive": xr.Dataset({"response": (_DIMS, response, say)}, chains),
+        "log_likelihood": xr.Dataset({"response": (_DIMS, log_likelihood)}, chains),
+        "observed_data": xr.Dataset({"response": ("obs_id", observed, say)}, coords),
         "constant_data": xr.Dataset(constants, coords, {"study": study.file.hash, "inference": study.inference}),
     }
+
+
+def _coordinates(cohort: Cohort, person: Int[np.ndarray, " n"], answer: Int[np.ndarray, " n"]) -> dict[str, Any]:
+    """Coordinates of the fitted responses: rows `person` of the cohort, places `answer` from 0."""
+    coords: dict[str, Any] = {
+        "obs_id": np.arange(1, len(person) + 1),
+        "participant": ("obs_id", np.array(cohort.names, object)[person]),
+        "answer": ("obs_id", answer + 1),
+    }
+    if cohort.numbers is not None:
+        coords["trial"] = ("obs_id", cohort.numbers[person, answer], {"long_name": "trial of the table"})
+    if cohort.session is not None:
+        coords["session"] = ("obs_id", np.array(cohort.sessions, object)[cohort.session[person, answer]])
+    return coords
 
 
 def _attributes(parameter: Parameter) -> dict[str, Any]:
@@ -79,23 +84,6 @@ def _attributes(parameter: Parameter) -> dict[str, Any]:
     if not parameter.levels:
         return {"units": parameter.unit}
     return {"levels": ", ".join(f"{k} = {level}" for k, level in enumerate(parameter.levels))}
-
-
-def _of_answers(
-    values: Float[np.ndarray, "1 draws M n"], mask: Bool[np.ndarray, "M n"], names: Sequence[str]
-) -> xr.Dataset:
-    """The log-likelihoods of the used slots (`mask`) as a dataset with one dimension `obs_id`, by participant and then
-    by response."""
-    person, answer = np.nonzero(mask)
-    chain, draw, *_ = values.shape
-    coords = {
-        "chain": np.arange(chain),
-        "draw": np.arange(draw),
-        "obs_id": np.arange(1, len(person) + 1),
-        "participant": ("obs_id", np.array(names, object)[person]),
-        "answer": ("obs_id", answer + 1),
-    }
-    return xr.Dataset({"response": (("chain", "draw", "obs_id"), values[..., person, answer])}, coords)
 
 
 def inference_data(study: Study, cohort: Cohort, posteriors: Posterior, draws: int = 200, seed: int = 0) -> Any:
@@ -124,10 +112,9 @@ def write_groups(datasets: dict[str, xr.Dataset], path: str | os.PathLike) -> No
 def predictive_shares(datasets: dict[str, xr.Dataset], categories: int) -> tuple[np.ndarray, np.ndarray]:
     """Proportion of each category in the observed responses (C,), and in each draw of predicted ones (draws, C)."""
     observed = datasets["observed_data"]["response"].values
-    held = observed >= 0
-    predicted = datasets["posterior_predictive"]["response"].values[0][:, held]
+    predicted = datasets["posterior_predictive"]["response"].values[0]
     count = [np.mean(predicted == k, axis=1) for k in range(categories)]
-    return np.bincount(observed[held], minlength=categories) / held.sum(), np.stack(count, axis=1)
+    return np.bincount(observed, minlength=categories) / observed.size, np.stack(count, axis=1)
 
 
 @program
