@@ -6,8 +6,11 @@ device with simulated people, in about a quarter of an hour, and writes the page
 """
 
 import argparse
+import json
 import re
+import sys
 import tempfile
+import tomllib
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -66,6 +69,17 @@ def write_study(size: Size, folder: Path) -> None:
     shared = {"trials": size.trials, "least": min(10, size.trials), "people": size.people, "protocol": PROTOCOL}
     text = Path(__file__).with_name("haptic.toml").read_text(encoding="utf-8")
     (folder / "haptic.toml").write_text(text.format(**numbers, **shared), encoding="utf-8")
+
+
+def look_at_pilot(folder: Path) -> None:
+    """Say on stderr if an interval of the pilot does not hold the study file's value, as the page says they all do."""
+    given = tomllib.loads((folder / "haptic.toml").read_text(encoding="utf-8"))["gp"]
+    pilot = json.loads((folder / "pilot" / "result.json").read_text(encoding="utf-8"))["pilot"]["intervals"]
+    for name, intervals in pilot.items():
+        values = given[name] if isinstance(given[name], list) else [given[name]]
+        for value, (low, high) in zip(values, intervals, strict=True):
+            if not low <= value <= high:
+                print(f"{name} = {value} is not within {low:.3g} to {high:.3g}: correct the page", file=sys.stderr)
 
 
 def sessions(lab: Lab, plan: str, folder: Path) -> str:
@@ -167,6 +181,7 @@ own.""",
             f"hilbo power haptic.toml --material foam --participants {size.counts} --trials {size.trials}"
             f" --studies {size.studies} --out power",
             r"power/",
+            before=look_at_pilot,
             figures=(("power/power.png", "Error of the optimum, share of studies within it, error of the map."),),
         ),
         Step(

@@ -103,7 +103,7 @@ def session(
         held.callback(let_go, log, resume)
         place.gate.keep_in(keys_path(log.path))
         if hub.state.study.stimulus is not None and line.device != "sim":
-            raise InputError(f"{study}: a program or a person presents, and a device nothing; leave --device out.")
+            raise InputError(f"{study}: a program or a person presents, and no device is used; leave --device out.")
         hub.gap = served.gap
         _say_changes(study, hub.state.study)
         _serve(hub, place, served, as_json)

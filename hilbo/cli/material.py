@@ -20,7 +20,7 @@ def identify(
     table: Annotated[Path, typer.Argument(help="Creep and relaxation tests (CSV or Parquet).", show_default=False)],
     out: Out,
     material: Annotated[
-        str | None, typer.Option(help="Which of the table's materials; the name of one that is not named there.")
+        str | None, typer.Option(help="Which of the table's materials, or its name if the table has no column for it.")
     ] = None,
     taps: Taps = 101,
     period: Period = 1e-3,

@@ -20,7 +20,7 @@ __all__ = [
 ]
 
 AROUND = 3  # half-width (rows) of the local line
-_GAP = 5.0  # median time steps, above which a step is a gap
+_GAP = 1.5  # median time steps, above which a step is a gap
 
 
 def local_line(values: Float[np.ndarray, "R m"], chosen: Bool[np.ndarray, " m"]) -> Float[np.ndarray, "R m"]:
@@ -55,15 +55,12 @@ def position_driven(test: Test) -> Test:
 
 
 def lost_contact(test: Test) -> int | None:
-    """Index of the first row without contact before the first gap in the rows of a test in which the force is 0, as
-    `hilbo.identification.motor.pressing` leaves one out; None without such a gap."""
+    """Index of the first row without contact, before the first gap in the rows of a test after contact in which the
+    force is 0, as `hilbo.identification.motor.pressing` leaves rows out; None without such a gap."""
     force, step = _force_and_position(test)[0], np.diff(test.time)
     none = np.all(force == 0, axis=0)
-    gaps = np.flatnonzero((step > _GAP * np.median(step)) & none[:-1] & none[1:])
-    if gaps.size == 0:
-        return None
-    touched = np.flatnonzero(~none[: gaps[0]])
-    return int(touched[-1]) + 1 if touched.size else None
+    gaps = np.flatnonzero((step > _GAP * np.median(step)) & none[:-1] & none[1:] & np.logical_or.accumulate(~none)[:-1])
+    return None if gaps.size == 0 else int(np.flatnonzero(~none[: gaps[0]])[-1]) + 1
 
 
 def interpolated(

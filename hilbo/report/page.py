@@ -1,6 +1,6 @@
 """HTML and Markdown pages of results, from the Jinja templates of this folder, and the filters of the templates."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cache
 from itertools import islice
 from typing import Any
@@ -12,6 +12,7 @@ from hilbo.population.rules.registry import RECOMMENDED, RULES
 from hilbo.report.kernel_words import covariance_words, formula
 from hilbo.report.participants import People
 from hilbo.study.config import Study
+from hilbo.study.formats.toml_text import toml_key, toml_string
 
 __all__ = ["Pictures", "estimate_words", "heads", "number", "percent", "rendered", "results_page", "text_of"]
 
@@ -104,6 +105,8 @@ def _environment() -> Environment:
     environment.filters |= {
         "number": number,
         "extent": _extent,
+        "ends": _ends,
+        "as_toml": _as_toml,
         "percent": percent,
         "symbol": _symbol,
         "unit": _unit,
@@ -148,6 +151,25 @@ def _extent(values: list[float | str]) -> str:
     if isinstance(values[0], str) or values[0] == values[1]:
         return "= " + " or ".join(map(number, dict.fromkeys(values)))
     return f"from {number(values[0])} to {number(values[1])}"
+
+
+def _ends(values: list[float | str]) -> str:
+    """Range of a parameter's values as text, for a cell: "1 to 2" for the two ends `values`, "1" if they are equal, and
+    "a or b" for names of levels.
+    """
+    if isinstance(values[0], str) or values[0] == values[1]:
+        return " or ".join(map(number, dict.fromkeys(values)))
+    return f"{number(values[0])} to {number(values[1])}"
+
+
+def _as_toml(parameters: Mapping[str, float | str], study: Study) -> str:
+    """A rendering as a table of TOML text, with units as comments."""
+    units = {"K0": "N/mm"} | {p.name: p.unit for p in study.space.parameters}
+    lines = ["[optimum]"]
+    for name, value in parameters.items():
+        text = toml_string(value) if isinstance(value, str) else repr(value)
+        lines.append(f"{toml_key(name)} = {text}" + (f" # {units[name]}" if units[name] else ""))
+    return "\n".join(lines)
 
 
 def percent(share: float, digits: int = 0) -> str:

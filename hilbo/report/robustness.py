@@ -94,6 +94,8 @@ def gp_table(content: Content) -> str:
         ends = ", ".join(f"{low:.3g} to {high:.3g}" for low, high in intervals.get(name, []))
         remark = f"95 %: {ends}" if ends else "as in the study file"
         lines.append(f"{name} = {_four_digits(learned[name])}" + (f" # {remark}" if pilot else ""))
+    if content["inference"] != "laplace":
+        lines.append(f'inference = "{content["inference"]}"')
     return "\n".join(lines)
 
 
@@ -168,6 +170,7 @@ def robustness_result(
             "noise": np.asarray(model.likelihood.noise).tolist(),
             "thresholds": np.asarray(model.likelihood.thresholds).tolist(),
         },
+        "inference": study.inference,
         "pilot": pilot and _pilot_content(pilot),
         "sensitivity": check.sensitivity and {name: np.asarray(v).tolist() for name, v in check.sensitivity.items()},
         "study": study.file.hash,

@@ -1,6 +1,5 @@
 """Text of a new, commented study file from a few settings; the text is parsed and checked before it is returned."""
 
-import json
 import re
 import tomllib
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ from hilbo.search.box import Parameter
 from hilbo.study.file.constraint_words import constraint_of
 from hilbo.study.file.reading import StudyFile, checked
 from hilbo.study.formats.parsing import UNREADABLE
+from hilbo.study.formats.toml_text import toml_key, toml_string
 
 __all__ = ["NewStudy", "parameter_of", "study_text"]
 
@@ -60,7 +60,7 @@ def parameter_of(text: str) -> Parameter:
     scale = others[2] if len(others) > 2 else "linear"
     named = bool(equals and name.strip()) and name.isprintable()
     if not named or ends is None or len(others) > 3 or scale not in ("linear", "log", "integer"):
-        raise InputError(f"--parameter is {_quoted(text)}; write {_FORM}, for example hue=140:260:deg.")
+        raise InputError(f"--parameter is {toml_string(text)}; write {_FORM}, for example hue=140:260:deg.")
     unit = others[1].strip() if len(others) > 1 else ""
     if scale == "integer":
         return Parameter(name.strip(), *ends, unit, integer=True)
@@ -76,7 +76,7 @@ def study_text(new: NewStudy) -> str:
         new=new,
         parameters=parameters,
         constraints=constraints,
-        responses=", ".join(map(_quoted, new.responses)),
+        responses=", ".join(map(toml_string, new.responses)),
         definitions=[(name, _DEFINITIONS[name]) for name in new.responses if name in _DEFINITIONS],
         recommended=RECOMMENDED,
         default=DEFAULT,
@@ -103,7 +103,7 @@ def _build(file: StudyFile) -> None:
 def _as_written(sentence: str, constraints: Sequence[str]) -> str:
     """An error sentence in which each key `constraints.N` is replaced by the --constraint option that it came from."""
     return re.sub(
-        r"constraints\.(\d+)(\.terms)?", lambda m: f"--constraint {_quoted(constraints[int(m[1]) - 1])}", sentence
+        r"constraints\.(\d+)(\.terms)?", lambda m: f"--constraint {toml_string(constraints[int(m[1]) - 1])}", sentence
     )
 
 
@@ -116,7 +116,7 @@ def _template() -> Template:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"quoted": _quoted, "key": _key, "noted": _noted, "tolerances": _tolerances}
+    environment.filters |= {"quoted": toml_string, "key": toml_key, "noted": _noted, "tolerances": _tolerances}
     return environment.get_template("study.toml")
 
 
@@ -149,16 +149,6 @@ def _tolerances(parameters: Sequence[Parameter], part: int) -> str:
     """Inline TOML table of the presentation tolerance of each numeric parameter: range / `part`, and 1 / `part`
     (relative) on a logarithmic scale, which a comment says."""
     tolerances = {p.name: (1 if p.scale == "log" else p.high - p.low) / part for p in parameters if not p.levels}
-    logs = " and ".join(_quoted(p.name) for p in parameters if p.scale == "log")
+    logs = " and ".join(toml_string(p.name) for p in parameters if p.scale == "log")
     shares = f"  # of {logs} a share of the value, the scale is logarithmic" if logs else ""
-    return "{" + ", ".join(f"{_quoted(name)} = {value:.2g}" for name, value in tolerances.items()) + "}" + shares
-
-
-def _key(name: str) -> str:
-    """A TOML key, quoted unless it is a bare key."""
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _quoted(name)
-
-
-def _quoted(text: str) -> str:
-    """Text as a quoted TOML string (JSON syntax)."""
-    return json.dumps(text, ensure_ascii=False)
+    return "{" + ", ".join(f"{toml_string(name)} = {value:.2g}" for name, value in tolerances.items()) + "}" + shares

@@ -57,7 +57,7 @@ def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
     place = ("--logs", logs, "--port", 0, "--participant", "P01")
     device = ("--device", tmp_path / "none")
     words = refused(DATA.parent / "video_quality.toml", *place, "--dry-run", *device)
-    assert "a program or a person presents, and a device nothing; leave --device out" in words
+    assert "a program or a person presents, and no device is used; leave --device out" in words
     with pytest.raises(InputError, match="cannot be read"):
         rehearse(tmp_path / "none.toml", tmp_path / "rehearsal")
     assert not (tmp_path / "rehearsal").exists()

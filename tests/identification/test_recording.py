@@ -105,6 +105,11 @@ def test_a_creep_test_that_is_fitted_in_its_force_ends_where_contact_was_lost():
     np.testing.assert_array_equal(driven.output, force[:, :560])
     np.testing.assert_array_equal(driven.time, creep.time[:560])
     assert "The handle left the material at 0.56 s of the creep test" in said(lost)
+    short = without(Test("creep", creep.time, creep.output, force), slice(600, 602))
+    assert lost_contact(short) == 560
+    early = (np.pad(values, ((0, 0), (1, 0))) for values in (lost.output, lost.input))
+    late = Test("creep", np.append(0.0, lost.time + 0.5), *early)
+    assert lost_contact(late) == 561  # a pause before the first contact
     touching = without(Test("creep", creep.time, creep.output, creep.input + 0.1), slice(562, 698))
     assert lost_contact(touching) is None and lost_contact(creep) is None
     assert position_driven(touching).time.size == touching.time.size

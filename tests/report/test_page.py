@@ -1,6 +1,9 @@
 """Pages: a number that a template misses is an error, and what a page says of the same numbers told differently."""
 
+import dataclasses
 import re
+import tomllib
+from html import unescape
 from pathlib import Path
 from types import MappingProxyType
 
@@ -10,6 +13,7 @@ from jinja2 import UndefinedError
 from studies import plain_study
 
 import hilbo
+from hilbo import Study
 from hilbo.report.page import _environment, rendered
 from hilbo.report.robustness import robustness_page
 from hilbo.report.study import report as study_report
@@ -120,6 +124,7 @@ def robust(nrmse, resampled=MappingProxyType({"median": 0.02, "95 %": 0.025}), s
         ],
         "pilot": None,
         "learned": learned,
+        "inference": "laplace",
         "sensitivity": sensitivity,
         "versions": VERSIONS,
     }
@@ -169,3 +174,28 @@ def test_no_two_macros_have_one_name():
     source = (Path(hilbo.__file__).parent / "report" / "templates" / "parts.html").read_text(encoding="utf-8")
     names = re.findall(r"{% macro (\w+)\(", source)
     assert len(names) > 10 and len(names) == len(set(names))
+
+
+@pytest.mark.parametrize("region", [None, {"u": [0.2, 0.4], "bit rate": [1.0, 1.0], "größe.x": ["from wood", "tin"]}])
+def test_the_card_of_a_page_has_the_answer(region):
+    """In any words: levels and names of parameters stay as they are, and the TOML can be read."""
+    raw = {"schema": 1, "study": {"name": "s", "responses": ["bad", "good"]}, "aggregation": {"rule": "learnt-2"}}
+    levels = {"levels": ["from wood", "tin"]}
+    scale = {"low": 0.0, "high": 2.0, "unit": "kbit/s"}
+    study = Study.from_dict(raw | {"parameters": {"u": scale, "bit rate": scale, "größe.x": levels}})
+    best = {"u": 0.3, "bit rate": 1.0, "größe.x": "from wood"}
+    numbers = [
+        {"key": "population_error", "result": "Population error", "value": float("nan")},
+        {"key": "individual_error", "result": "Individual error", "value": 12.5},
+    ]
+    content = {"optimum": {"parameters": best, "class_probabilities": {"bad": 0.2, "good": 0.8}}, "rule": "learnt-2"}
+    content |= {"highest_answer": {"low": 0.6, "high": 0.9}, "key_numbers": numbers}
+    content["optimum_region"] = region and {"probability": 0.95, "volume": 0.1, "located": True, "parameters": region}
+    card = _environment().from_string('{% import "card.html" as answer %}{{ answer.card(study, content, 3, 60) }}')
+    text = unescape(card.render(study=dataclasses.replace(study, learnt=object()), content=content))
+    assert tomllib.loads(re.search(r"<pre>(.*?)</pre>", text, re.S)[1])["optimum"] == best
+    said = " ".join(text.split())
+    assert "nan" not in said and "Individual error: 12.5 %" in said and "80 % (95 % interval 60 % to 90 %)" in said
+    assert ("from wood or tin" in said and "0.2 to 0.4" in said) == (region is not None)
+    assert ("Located: the region is 10 %" in said) == (region is not None)
+    assert ("region was not computed" in said) == (region is None)

@@ -171,7 +171,7 @@ def test_a_program_renders_the_fosls_where_the_study_says_so():
     study = Study.from_dict(FOSLS | {"stimulus": {}})
     assert study.file.stimulus.role == "stimulus" and study.file.meaning != Study.from_dict(FOSLS).file.meaning
     with pytest.raises(InputError, match="nobody renders a force by hand"):
-        Study.from_dict(FOSLS | {"stimulus": {"by": "person", "within": 60.0, "silence": 10.0}})
+        Study.from_dict(FOSLS | {"stimulus": {"by": "person"}})
 
 
 def test_K0_is_sent_need_not_be_confirmed_and_counts_as_sent():
@@ -186,6 +186,8 @@ def test_K0_is_sent_need_not_be_confirmed_and_counts_as_sent():
     for wrong in (asked["K0"] * 1.001, float("nan")):
         with pytest.raises(RefusedError, match="K0 is confirmed as"):
             check_confirmed(study.file, asked, asked | {"K0": wrong})
+    with pytest.raises(RefusedError, match="K0 is confirmed as"):
+        check_confirmed(study.file, own, asked)
 
 
 def compared(study, off):

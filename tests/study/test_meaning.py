@@ -196,3 +196,8 @@ def test_a_plan_serves_a_study_file_that_has_changed_in_what_responses_do_not_de
     assert planned_by(plan, header, begun) and not planned_by(plan, planned_header(plan, now, "P02"), begun)
     with pytest.raises(InputError, match="belongs to another study"):
         check_plan(plan, BOUND["parameters.u.high"].file)
+
+
+def test_the_meaning_of_the_papers_study_stays():
+    """Plans and results hold it: another way to compute it would refuse them."""
+    assert Study.load("hilbo/data/paper.toml").file.meaning == "90d8924ba333f426"

@@ -27,5 +27,5 @@ def test_two_people_are_no_pilot():
 
 def test_a_rule_that_learns_needs_no_pilot():
     study = plain_study(2)
-    with pytest.raises(InputError, match="learns its hyperparameters from the study itself"):
+    with pytest.raises(InputError, match="learns its hyperparameters from the study and needs no"):
         check_pilot(dataclasses.replace(study, rule="learnt-2"), answered(study, people=3))

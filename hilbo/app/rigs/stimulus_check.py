@@ -28,6 +28,19 @@ class Measured(NamedTuple):
     why: str
 
 
+def _example(study: StudyFile) -> dict[str, float]:
+    """A rendering of a study, as orders have it: the middle of all ranges; with [renderer] a passive one, with K0."""
+    space = study.space
+    if space.mechanics is None:
+        middles = ((p, p.middle) for p in space.parameters)
+        return {p.name: float(round(middle)) if p.discrete else middle for p, middle in middles}
+    from hilbo.search.rendering import Rendering
+    from hilbo.search.space import SearchSpace
+
+    searched = SearchSpace(space.parameters, space.mechanics, space.constraints)
+    return Rendering.at(searched, searched.candidates(1, 0)[0]).parameters
+
+
 class StimulusCheck:
     """In the place of a hub, for `serve`. It waits `patience` s for the program to join; `measured` is None until the
     check is over."""
@@ -37,6 +50,7 @@ class StimulusCheck:
         self.watchers = Watchers(lambda: "")
         self.measured: Measured | None = None
         self._study, self._patience = study, patience
+        self._rendering = _example(study)
         self._done: Callable[[], Any] = lambda: None
         self._task: asyncio.Task | None = None
 
@@ -70,7 +84,7 @@ class StimulusCheck:
         try:
             await self._joined()
             for number in range(_OFTEN):
-                presented.append(await self._timed(self.rig.show(self._middle(number))))
+                presented.append(await self._timed(self.rig.show(self._showing(number))))
                 stopped.append(await self._timed(self.rig.estop()))
                 await self.rig.clear()
         except (RuntimeError, InputError) as error:
@@ -87,11 +101,9 @@ class StimulusCheck:
                 raise RuntimeError(self.rig.snapshot.lost)
             await asyncio.sleep(0.02)
 
-    def _middle(self, number: int) -> Showing:
-        """A request for the rendering in the middle of all ranges, in trial `number` + 1."""
-        middles = ((p, p.middle) for p in self._study.space.parameters)
-        values = {p.name: float(round(middle)) if p.discrete else middle for p, middle in middles}
-        return Showing(number + 1, 1, 0, "a", values, None)
+    def _showing(self, number: int) -> Showing:
+        """A request for a rendering in trial `number` + 1."""
+        return Showing(number + 1, 1, 0, "a", self._rendering, None)
 
     @staticmethod
     async def _timed(work: Any) -> float:

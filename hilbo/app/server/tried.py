@@ -68,9 +68,7 @@ def check_study(study: StudyFile) -> None:
     """Raise `InputError` unless the page of `hilbo try` can present the study: K1, B1 and alpha of one material,
     presented by a program and shown to the experimenter, three responses, and one step with the rendering."""
     if study.space.mechanics is not None:
-        raise InputError(
-            f"{study.source}: has a [renderer], and hilbo try presents by itself; use one with [stimulus]."
-        )
+        raise InputError(f"{study.source}: has a [renderer], and hilbo try presents by itself; use one without it.")
     if study.stimulus.by == "person" or study.stimulus.experimenter_sees is False:
         raise InputError(
             f"{study.source}: the page of hilbo try presents by itself and shows the map at the end; leave by and"

@@ -25,8 +25,9 @@ def check_confirmed(study: StudyFile, asked: Mapping[str, float], values: Mappin
         raise RefusedError("bad-answer", f"a confirmation has a value for {', '.join(names)}, and for nothing else.")
     assert study.stimulus is not None  # whoever asks has looked
     for name in _derived(study) & set(values):
-        if not abs(values[name] - asked[name]) <= _EXACT * abs(asked[name]):
-            raise RefusedError("off", f"{name} is confirmed as {values[name]:g}, and {asked[name]:g} was asked for.")
+        wanted = asked.get(name, math.nan)
+        if not abs(values[name] - wanted) <= _EXACT * abs(wanted):
+            raise RefusedError("off", f"{name} is confirmed as {values[name]:g}, and {wanted:g} was asked for.")
     for parameter in study.space.parameters:
         value, wanted = values[parameter.name], asked[parameter.name]
         most = study.stimulus.off_by(parameter, wanted)

@@ -5,8 +5,9 @@ The delete-one jackknife over participants: the criterion is maximised without e
     SE^2 = (M - 1) / M  sum_j (theta_(j) - mean theta_(.))^2,
 
 on the logarithms of theta and noise, and on the thresholds as they are. Intervals are the estimate ± t(M - 1) SE.
-Responses of one participant depend on each other, so that participants, not responses, are left out. Reference: Efron
-& Stein (1981), Annals of Statistics 9(3):586.
+Responses of one participant depend on each other, so that participants, not responses, are left out. The intervals
+contain the variation between participants; that few people give a smaller theta than many is a bias, which they do not
+contain (benchmarks/pilot.py). Reference: Efron & Stein (1981), Annals of Statistics 9(3):586.
 """
 
 from collections.abc import Callable
@@ -33,7 +34,8 @@ class Pilot(NamedTuple):
     """Confidence intervals of the hyperparameters that a pilot of `participants` was optimised for.
 
     `intervals`: hyperparameter ("theta", "noise", "thresholds") -> 95 % intervals (k, 2) of its values; a threshold is
-    in units of the latent function. `unfinished`: participants without whom the search did not converge.
+    in units of the latent function. `unfinished`: participants without whom the search did not
+    converge, or had no maximum in reach.
     """
 
     participants: int
@@ -56,7 +58,7 @@ def pilot(
     for i, name in enumerate(names, 1):
         say(f"without participant {i} of {len(names)}")
         without.append(fixed_and_optimised(study, cohort.of([other for other in names if other != name]), both.learn))
-    unfinished = tuple(name for name, each in zip(names, without, strict=True) if not each.converged)
+    unfinished = tuple(name for name, each in zip(names, without, strict=True) if not each.converged or each.runaway)
     intervals = {}
     for name in both.learn:
         scaled, back = (np.asarray, np.asarray) if name == "thresholds" else (np.log, np.exp)

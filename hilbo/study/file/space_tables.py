@@ -188,9 +188,9 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
         )
     tables.session.check(labels)
     if tables.stimulus is not None:
-        tables.stimulus.check(parameters)
         if tables.renderer is not None and tables.stimulus.by == "person":
             raise InputError('stimulus.by is "person" beside renderer; nobody renders a force by hand: leave one out.')
+        tables.stimulus.check(parameters)
     if tables.simulation is not None:
         tables.simulation.check(parameters, len(labels), labels.index(goal) if goal else len(labels) - 1)
     _check_gp(tables.gp, tables.aggregation.rule, len(labels))
