@@ -4,6 +4,7 @@ sufficient.
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from hilbo.report.page import rendered
@@ -11,6 +12,7 @@ from hilbo.report.result_file import write_result
 from hilbo.report.results import save_figures, versions
 from hilbo.simulation.power import Plan, power_table, summarise
 from hilbo.study.config import Study
+from hilbo.study.file.protocols import protocol
 from hilbo.study.formats.json_file import Content
 
 __all__ = ["enough", "write_power"]
@@ -31,6 +33,15 @@ def enough(summary: pd.DataFrame, chance: float = _CHANCE) -> pd.DataFrame:
     return good.reindex(sorted(summary["participants"].unique())).rename("trials").reset_index()
 
 
+def _hours(study: Study, participants: float, trials: float) -> float | None:
+    """Duration of the steps of all sessions of a design, warm-up included, h; None for an unknown number of trials.
+    Answers and breaks are not included."""
+    if np.isnan(trials):
+        return None
+    warm_up, chosen = (protocol(study.file.session, phase) for phase in ("warm-up", "optimisation"))
+    return participants * (warm_up.count * warm_up.seconds + trials * chosen.seconds) / 3600
+
+
 def write_power(study: Study, errors: pd.DataFrame, plan: Plan, error: float, cost: Content, folder: Path) -> Content:
     """Write errors.csv, power.csv, result.json, the figure and report.html into an existing folder; return the content
     of result.json.
@@ -47,7 +58,7 @@ def write_power(study: Study, errors: pd.DataFrame, plan: Plan, error: float, co
     content = {
         "error": error,
         "summary": summary.to_dict("records"),
-        "enough": enough(summary).to_dict("records"),
+        "enough": [row | {"hours": _hours(study, **row)} for row in enough(summary).to_dict("records")],
         "studies": plan.studies,
         "seed": plan.seed,
         "rule": study.rule,

@@ -17,7 +17,7 @@ from hilbo.cli.terminal.console import start
 from hilbo.errors import InputError
 from hilbo.likelihoods import Goal
 from hilbo.report.figures.power import power_figure
-from hilbo.report.power import enough, write_power
+from hilbo.report.power import _hours, enough, write_power
 from hilbo.simulation.power import (
     Plan,
     _with_trials,
@@ -107,6 +107,13 @@ def test_the_surest_share_is_the_exact_bound():
     all_of_them = summarise(errors.assign(optimum=0.0), 0.5)["reached_surely"][0]
     assert all_of_them == pytest.approx(0.05 ** (1 / 40), rel=1e-12)
     assert summarise(errors.assign(optimum=1.0), 0.5)["reached_surely"][0] == 0.0
+
+
+def test_hours_are_those_of_all_steps():
+    """The paper's: 12 renderings of warm-up and 25 trials of 8 s."""
+    paper = Study.load("hilbo/data/paper.toml")
+    assert _hours(paper, participants=24.0, trials=25.0) == pytest.approx(24 * 37 * 8 / 3600)
+    assert _hours(paper, participants=24.0, trials=float("nan")) is None
 
 
 @pytest.mark.parametrize("rule", ["average", "learnt-2"])
