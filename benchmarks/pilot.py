@@ -31,10 +31,10 @@ from rows import Rows  # noqa: E402
 
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
-from hilbo.study.analysis.optimised import LEARNABLE, fixed_and_optimised  # noqa: E402
-from hilbo.study.analysis.pilot import pilot  # noqa: E402
 from hilbo.study.estimate.aggregate import aggregate_cohort  # noqa: E402
 from hilbo.study.estimate.learnt import that_learns  # noqa: E402
+from hilbo.study.robustness.optimised import LEARNABLE, fixed_and_optimised  # noqa: E402
+from hilbo.study.robustness.pilot import pilot  # noqa: E402
 
 MANY, COUNTS = 64, (4, 8)
 OTHERS = 50_000  # between the seeds of a pilot's people and of the study's

@@ -32,9 +32,9 @@ from hilbo.hyperparameters.judged_evidence import maximise_judged  # noqa: E402
 from hilbo.search.apart import nrmse  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
-from hilbo.study.analysis.optimised import LEARNABLE, fixed_and_optimised  # noqa: E402
 from hilbo.study.estimate.aggregate import aggregate_cohort  # noqa: E402
 from hilbo.study.estimate.learnt import that_learns  # noqa: E402
+from hilbo.study.robustness.optimised import LEARNABLE, fixed_and_optimised  # noqa: E402
 
 POPULATIONS = [f"paper-{i:02d}" for i in range(2, 30, 3)]
 PEOPLE, FIRST, LIMIT = 24, 1000, 0.03

@@ -17,8 +17,8 @@ import numpy as np
 import hilbo
 from hilbo import Study
 from hilbo.report.figures.maps import map_slices
-from hilbo.study.analysis.robustness import robustness
 from hilbo.study.cohort import cohort_of, read_trials
+from hilbo.study.robustness.robustness import robustness
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 

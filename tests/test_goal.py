@@ -19,11 +19,11 @@ from hilbo.session.choose.selection import design, next_point
 from hilbo.simulation.power import Plan, simulate_power
 from hilbo.simulation.presets import PRESETS
 from hilbo.study.analysis.best_mid_worst import best_mid_worst
-from hilbo.study.analysis.bootstrap import resampled_tops
 from hilbo.study.analysis.region import optimum_region, region_sentences
 from hilbo.study.analysis.tolerance import tolerance
 from hilbo.study.cohort import Cohort
 from hilbo.study.estimate.aggregate import fit_cohort
+from hilbo.study.estimate.bootstrap import resampled_tops
 from hilbo.study.estimate.optimum import individual_optima, map_optimum, score
 from hilbo.study.tables.validation import RESPONSES
 

@@ -131,8 +131,8 @@ def robustness(
         chosen, everybody, flagged = read_cohort(trials, study, material, say)
         cohort, left_out = _included(chosen, everybody, say)
         from hilbo.report.robustness import gp_table, write_robustness
-        from hilbo.study.analysis import pilot as pilots
-        from hilbo.study.analysis.robustness import robustness as check
+        from hilbo.study.robustness import pilot as pilots
+        from hilbo.study.robustness.robustness import robustness as check
 
         if pilot:
             pilots.check_pilot(chosen, cohort)

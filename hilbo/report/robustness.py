@@ -12,8 +12,6 @@ from hilbo.report.page import Pictures, rendered
 from hilbo.report.result_file import write_result
 from hilbo.report.results import optimum_content, save_figures, versions
 from hilbo.study.analysis.heterogeneity import how_aggregated
-from hilbo.study.analysis.pilot import Pilot
-from hilbo.study.analysis.robustness import LIMIT, NEAR, Place, Robustness
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, Surface
@@ -21,6 +19,8 @@ from hilbo.study.estimate.learnt import learnt_sentences
 from hilbo.study.estimate.location import location_notes
 from hilbo.study.formats.json_file import Content
 from hilbo.study.results.map_netcdf import map_dataset
+from hilbo.study.robustness.pilot import Pilot
+from hilbo.study.robustness.robustness import LIMIT, NEAR, Place, Robustness
 
 __all__ = ["gp_table", "robustness_page", "robustness_result", "write_robustness"]
 

@@ -10,8 +10,8 @@ from hilbo.report.results import write_results
 from hilbo.report.study.report import write_study
 from hilbo.study.analysis import analysis
 from hilbo.study.analysis.cohort_results import analyse_cohort
-from hilbo.study.analysis.optimised import fixed_and_optimised
 from hilbo.study.folder import Material, StudyFolder
+from hilbo.study.robustness.optimised import fixed_and_optimised
 
 pytestmark = [pytest.mark.deep, pytest.mark.empties_caches]
 PEOPLE, TRIALS = 3, 6

@@ -28,11 +28,11 @@ from hilbo.report.study.study_figures import comparison_figures
 from hilbo.report.validation import validate
 from hilbo.search.box import Parameter
 from hilbo.study.analysis.analysis import limits_of
-from hilbo.study.analysis.bootstrap import can_resample
 from hilbo.study.analysis.progress import Progress, _counts, _splits, _to_other_half
 from hilbo.study.analysis.tolerance import tolerance, tolerance_ends
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.estimate.aggregate import fit_cohort
+from hilbo.study.estimate.bootstrap import can_resample
 from hilbo.study.estimate.optimum import predict_people
 from hilbo.study.file.reserved_names import is_reserved
 from hilbo.study.folder import Reference

@@ -8,7 +8,7 @@ from scipy import stats
 from studies import answered, plain_study
 
 from hilbo.errors import InputError
-from hilbo.study.analysis.pilot import _interval, check_pilot
+from hilbo.study.robustness.pilot import _interval, check_pilot
 
 
 def test_the_jackknife_of_a_mean_is_its_t_interval():

@@ -13,13 +13,13 @@ from hilbo.hyperparameters.maximum_evidence import maximise_evidence
 from hilbo.ordinal_gp import Trials, fit
 from hilbo.population.judged.left_out_evidence import left_out_evidence
 from hilbo.search.candidates import search_points
-from hilbo.study.analysis.optimised import fixed_and_optimised
-from hilbo.study.analysis.robustness import NEAR, robustness
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import fit_cohort
 from hilbo.study.estimate.learnt import that_learns
 from hilbo.study.estimate.optimum import population_optimum
+from hilbo.study.robustness.optimised import fixed_and_optimised
+from hilbo.study.robustness.robustness import NEAR, robustness
 
 pytestmark = pytest.mark.deep
 

@@ -67,7 +67,7 @@ class Tried:
 def check_study(study: StudyFile) -> None:
     """Raise `InputError` unless the page of `hilbo try` can present the study: K1, B1 and alpha of one material,
     presented by a program and shown to the experimenter, three responses, and one step with the rendering."""
-    if study.space.mechanics is not None:
+    if study.space.mechanics is not None or study.stimulus is None:
         raise InputError(f"{study.source}: has a [renderer], and hilbo try presents by itself; use one without it.")
     if study.stimulus.by == "person" or study.stimulus.experimenter_sees is False:
         raise InputError(

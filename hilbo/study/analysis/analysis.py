@@ -21,7 +21,6 @@ from hilbo.search.candidates import search_points
 from hilbo.study.analysis.best_mid_worst import Sets, best_mid_worst, second_choice_sentence
 from hilbo.study.analysis.cohort_results import CohortResults, Say, analyse_cohort
 from hilbo.study.analysis.heterogeneity import how_aggregated
-from hilbo.study.analysis.optimised import FixedAndOptimised, fixed_and_optimised
 from hilbo.study.analysis.progress import Progress
 from hilbo.study.analysis.rule_comparison import FEWEST, compare
 from hilbo.study.analysis.tolerance import Ends, Tolerance, tolerance, tolerance_ends
@@ -33,6 +32,7 @@ from hilbo.study.estimate.location import goal_sentences, location_sentences
 from hilbo.study.estimate.optimum import map_optimum
 from hilbo.study.exclusion import included
 from hilbo.study.formats.json_file import Content
+from hilbo.study.robustness.optimised import FixedAndOptimised, fixed_and_optimised
 
 __all__ = ["Analysis", "Reading", "analyse", "limits_of", "moved_by_evidence"]
 

@@ -36,11 +36,11 @@ from hilbo.population.rules.registry import GIVEN, RECOMMENDED, RULES
 from hilbo.population.shared.hierarchical import Share
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
-from hilbo.study.analysis.bootstrap import resampled_tops
 from hilbo.study.analysis.heterogeneity import SURE, share_content
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate
+from hilbo.study.estimate.bootstrap import resampled_tops
 from hilbo.study.estimate.learnt import resolved, that_learns
 from hilbo.study.estimate.optimum import map_optimum
 

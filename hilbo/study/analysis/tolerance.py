@@ -33,8 +33,8 @@ from hilbo.population.newcomer import class_probabilities
 from hilbo.population.pointwise import aggregate
 from hilbo.population.shared.scale_use import ScaleUse
 from hilbo.search.space import Bound
-from hilbo.study.analysis.bootstrap import can_resample
 from hilbo.study.config import Study
+from hilbo.study.estimate.bootstrap import can_resample
 
 __all__ = ["End", "Ends", "Predict", "Tolerance", "dominant", "slice_through", "tolerance", "tolerance_ends"]
 

@@ -28,12 +28,12 @@ from hilbo.population.maps import point_rule
 from hilbo.population.rules.registry import RULES
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
-from hilbo.study.analysis.bootstrap import can_resample, resampled_tops
-from hilbo.study.analysis.optimised import LEARNABLE, FixedAndOptimised, differentiable, fixed_and_optimised
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort
+from hilbo.study.estimate.bootstrap import can_resample, resampled_tops
 from hilbo.study.estimate.optimum import Optimum, map_optimum, population_optimum, predict_people, score
+from hilbo.study.robustness.optimised import LEARNABLE, FixedAndOptimised, differentiable, fixed_and_optimised
 
 __all__ = ["LIMIT", "NEAR", "Place", "Resampled", "Robustness", "robustness"]
 

@@ -20,9 +20,9 @@ from scipy import stats
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import OrdinalGP
 from hilbo.population.rules.registry import RULES
-from hilbo.study.analysis.optimised import FixedAndOptimised, fixed_and_optimised
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.robustness.optimised import FixedAndOptimised, fixed_and_optimised
 
 __all__ = ["FEWEST", "Pilot", "check_pilot", "pilot"]
 
