@@ -85,6 +85,7 @@ def test_no_smaller_variance_scores_above_the_optimistic_bound(category):
             assert np.all(np.asarray(score_(MEAN, jnp.full_like(MEAN, variance))) <= bound + 1e-12)
 
 
+@pytest.mark.deep  # compiles the search for optima, the region and trial selection of another study
 def test_a_mirrored_scale_has_the_same_optima_and_trials():
     parameters = "gain", "delay"
     up = study_of("", parameters=parameters)
@@ -111,6 +112,7 @@ def test_a_mirrored_scale_has_the_same_optima_and_trials():
         np.testing.assert_allclose(value, found[1][name], atol=1e-7, err_msg=name)
 
 
+@pytest.mark.deep  # compiles the search for optima, the region and trial selection of another study
 def test_a_goal_between_others_is_where_it_is_likeliest():
     study, trials = study_of(SCALE[1]), answers(1)
     candidates = search_points(study.space, 0)

@@ -281,7 +281,7 @@ def test_consent_comes_before_the_first_trial(tmp_path):
     with pytest.raises(InputError, match="agreed to protocol FENS-1, the study's is FENS-2"):
         check_consent(people, "P02", "FENS-2")
     for change, sentence in (
-        ({"participant": "Ada Lovelace"}, "nobody's name"),
+        ({"participant": "Ada Lovelace"}, "somebody's name"),
         ({"age": "old"}, "whole number of years"),
         ({"handedness": "paw"}, "right, left, both"),
         ({"consent_time": "yesterday"}, "write it as 2026"),
