@@ -148,8 +148,9 @@ def robustness(
 
 def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tuple[Any, Any, list[str]]:
     """Load a study and its trial table, or a folder of session logs. Returns the study of the one `material` (None: the
-    only one in the table), its cohort, and sentences on the trials that are left out because of the device's flags.
-    Calls `start`, and prints remarks on stderr; `say` is told of progress. Raises `InputError`."""
+    only one in the table), its cohort, and sentences on the trials that are left out because of the device's flags, and
+    on missing responses. Calls `start`, and prints remarks on stderr; `say` is told of progress. Raises `InputError`.
+    """
     say("reading")
     start()
     from hilbo.study.cohort import cohort_of
@@ -170,7 +171,10 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
         material = _only_material(pieces, trials)
     chosen = whole.material(material) if material and whole.file.materials else whole
     table = trial_table(pieces, chosen.file, material, source=str(trials), others=False, say=note_rows, note=note)
-    return chosen, cohort_of(table, chosen), flag_sentences_of(table.flags, chosen.file.exclude_flags)
+    missing = [f"{trials}: {sentence}" for sentence in table.missing.sentences]
+    if missing:
+        say.printed += missing  # by `note`
+    return chosen, cohort_of(table, chosen), [*flag_sentences_of(table.flags, chosen.file.exclude_flags), *missing]
 
 
 def _only_material(pieces: list[Any], source: Path) -> str | None:

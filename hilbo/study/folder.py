@@ -30,6 +30,7 @@ from hilbo.study.file.plan_file import read_plan
 from hilbo.study.file.trial_flags import FlagCounts, flag_sentences
 from hilbo.study.formats.csv_file import cell_pieces, numbers, parameter_values, read_cells
 from hilbo.study.tables.flag_counts import flag_counts
+from hilbo.study.tables.missing import Missing
 from hilbo.study.tables.sessions import SessionRow, read_session_table
 from hilbo.study.tables.trials import NothingToFitError, TrialTable, check_texts, joined, trial_table
 from hilbo.study.tables.validation import check_validation, sets_frame
@@ -61,6 +62,7 @@ class Material(NamedTuple):
     reference: Reference | None
     flags: FlagCounts = FlagCounts()
     """Counts of trials with a flag of the device, and of those excluded for it."""
+    missing: Missing = Missing()
 
 
 class StudyFolder(NamedTuple):
@@ -211,7 +213,7 @@ def _material(
     reference = _reference(material_study, name, sets, truth)
     validation = None if compared is None or compared.empty else compared
     cohort = cohort_of(table, material_study)
-    return Material(name, material_study, cohort, validation, reference, table.flags)
+    return Material(name, material_study, cohort, validation, reference, table.flags, table.missing)
 
 
 def _answers(name: str, study: Study, tables: Mapping[Path, list[pd.DataFrame]]) -> TrialTable:

@@ -10,16 +10,17 @@ from hilbo.errors import InputError, InputRemark
 from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.config import Study
 from hilbo.study.formats import csv_file
-from hilbo.study.tables.trials import write_trials
+from hilbo.study.formats.csv_file import cell_pieces
+from hilbo.study.tables.trials import trial_table, write_trials
 
 GP = {"theta": 3.0, "variance": 1.0, "thresholds": [-0.5, 0.5], "noise": 0.5}
 HEADER = "participant,trial,response,gain,delay\n"
 
 
-def study(responses=("different", "similar", "close"), **tables):
+def study(responses=("different", "similar", "close"), missing=(), **tables):
     gp = GP | {"thresholds": np.linspace(-0.5, 0.5, len(responses) - 1).tolist()}
     parameters = {"gain": {"low": 0.0, "high": 2.0, "unit": "N/mm"}, "delay": {"low": 1.0, "high": 100.0}}
-    table = {"name": "any", "responses": list(responses)}
+    table = {"name": "any", "responses": list(responses)} | ({"missing": list(missing)} if missing else {})
     return Study.from_dict({"schema": 1, "study": table, "parameters": parameters, "gp": gp} | tables)
 
 
@@ -539,3 +540,29 @@ def test_categories_alone_are_answers_and_are_checked():
     for wrong, words in mistakes:
         with pytest.raises(InputError, match=re.escape(words)):
             cohort_of(frame.assign(**wrong), study())
+
+
+MISSING = ("NA", "-1", "don't know", "")
+
+
+def test_missing_responses_are_counted_and_not_fitted(tmp_path):
+    """By label and participant, in any phase that would be fitted; without the key they are refused."""
+    of = study(missing=MISSING)
+    rows = [("A", "close"), ("A", " NA "), ("A", "similar"), ("B", "-1"), ("B", "close"), ("B", "NA"), ("B", "")]
+    lines = "".join(f"{name},{i},{cell},1,2\n" for i, (name, cell) in enumerate(rows, 1))
+    path = written(tmp_path, HEADER + lines)
+    with pytest.warns(InputRemark, match=r'4 of 7 answers are missing \("NA" 2, "-1" 1, "" 1\) and not fitted'):
+        table = trial_table(cell_pieces(path), of.file, source="t.csv")
+    assert table.rows["response"].tolist() == ["close", "similar", "close"] and (table.rows["category"] >= 0).all()
+    assert table.missing.content() == {
+        "labels": {"NA": 2, "-1": 1, "": 1},
+        "participants": {"A": 1, "B": 3},
+        "rows": 7,
+    }
+    assert 'response is "NA"' in refusal(tmp_path, HEADER + "A,1,NA,1,2\n")
+    assert "all are warm-up, repeated or voided, or missing" in refusal(tmp_path, HEADER + "A,1,NA,1,2\n", of=of)
+
+
+def test_a_response_is_not_missing():
+    with pytest.raises(InputError, match=r'study\.missing has "Close ", which is a response too'):
+        study(missing=("Close ",))

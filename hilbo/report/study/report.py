@@ -174,6 +174,7 @@ def _write_material(material, analysis: Analysis, validated, folder: Path, seed)
     content |= {
         "left_out": analysis.left_out,
         "flags": material.flags.content(),
+        "missing": material.missing.content(),
         "limits": list(analysis.limits),
         "optimised": _optimised(analysis),
         "tolerance": tables["tolerance"].to_dict("records"),
@@ -225,7 +226,10 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "answers": int(analysis.cohort.counts().sum()),
         "limits": analysis.limits,
         "left_out": analysis.left_out,
-        "flags": flag_sentences(material.flags, analysis.study.file.exclude_flags),
+        "flags": [
+            *flag_sentences(material.flags, analysis.study.file.exclude_flags),
+            *material.missing.sentences,
+        ],
         "figures": pictures,
         "typical": analysis.cohort.names[typical_person(analysis)],
         "unknown": UNKNOWN,

@@ -52,6 +52,8 @@ class StudyFile:
     """Attribute that is rated, such as "perceived realism"; used in axis labels."""
     exclude: str
     """Rule that excludes participants (`hilbo.population.judged.response_quality`), empty for none."""
+    missing: tuple[str, ...]
+    """Cells of a trial table that stand for a missing response."""
     exclude_flags: tuple[TrialFlag, ...]
     """Flags of the device that exclude a trial from the analysis (`hilbo.study.file.trial_flags`)."""
     space: Box

@@ -39,8 +39,8 @@ Acquisition = Literal["ucb", "log_ei", "thompson", "top_category"]
 
 
 class StudyTable(_Table, frozen=True):
-    """[study]: name, response labels (lowest first), the one that is the goal (by default the highest), rated attribute
-    and exclusion rules."""
+    """[study]: name, response labels (lowest first), the one that is the goal (by default the highest), rated
+    attribute, cells that stand for a missing response, and exclusion rules."""
 
     name: Annotated[str, msgspec.Meta(min_length=1), _text("a text", '"memory foam"')]
     responses: Annotated[
@@ -50,6 +50,7 @@ class StudyTable(_Table, frozen=True):
     ]
     goal: Annotated[str, _text("one of the responses", '"close"')] = ""
     attribute: Annotated[str, msgspec.Meta(min_length=1), _text("a text", '"perceived realism"')] = "perceived realism"
+    missing: Annotated[tuple[str, ...], _text("a list of texts", '["NA", "-1"]')] = ()
     exclude: Annotated[str, _text("a rule, or nothing", '"trials < 10 or lapse_low > 0.3"')] = ""
     exclude_flags: Annotated[
         tuple[TrialFlag, ...], _text("a list of some of " + ", ".join(FLAGS), '["saturated", "slewed"]')

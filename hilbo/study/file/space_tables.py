@@ -159,6 +159,10 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
     labels, selection = tables.study.responses, tables.selection
     if len(set(labels)) < len(labels):
         raise InputError(f"study.responses is {shown(labels)}; it must not have one label twice.")
+    known = {label.strip().casefold() for label in labels}
+    for label in tables.study.missing:
+        if label.strip().casefold() in known:
+            raise InputError(f"study.missing has {shown(label)}, which is a response too; leave it out of one of them.")
     goal = tables.study.goal
     if goal and goal not in labels:
         raise InputError(f"study.goal is {shown(goal)}; it must be one of the responses, {', '.join(labels)}.")

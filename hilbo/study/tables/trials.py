@@ -20,7 +20,7 @@ import pandas as pd
 from hilbo.errors import InputError, warn_caller
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES, FlagCounts
-from hilbo.study.formats.cell_text import FORMULA_WORDS, ID_WORDS, alike, check_text, formulas, invalid_ids, is_rounded
+from hilbo.study.formats.cell_text import FORMULA_WORDS, ID_WORDS, check_text, formulas, invalid_ids
 from hilbo.study.formats.csv_file import (
     FRAME,
     answer_forms,
@@ -30,6 +30,8 @@ from hilbo.study.formats.csv_file import (
     refuse,
 )
 from hilbo.study.tables.flag_counts import added, counted_flags, flagged
+from hilbo.study.tables.missing import Missing, missing_labels
+from hilbo.study.tables.remarks import note_absent, note_doubtful_ids
 
 __all__ = [
     "NOT_FITTED",
@@ -55,7 +57,7 @@ NOT_FITTED = ("warm-up", "repeat")
 """Phases whose responses are kept but never fitted: familiarisation, and repetitions for test-retest agreement."""
 _KEY = ("participant", "session", "phase", "material", "trial")
 _TRUE = {"1", "1.0", "1,0", "true", "yes"}
-_NAMED = 6  # people of whom a remark says the names
+_NONE = -1  # category of a missing response, which is never fitted
 _MISSING = {"", "nan", "none", "<na>"}
 _FALSE = {"", "0", "0.0", "0,0", "false", "no", "nan", "none", "<na>"}
 
@@ -67,6 +69,8 @@ class TrialTable(NamedTuple):
     """The rows to be fitted, with the column `category` (0 = lowest response) and levels by their index."""
     flags: FlagCounts
     """Counts of trials with a flag of the device, and of those excluded for it."""
+    missing: Missing = Missing()
+    """Counts of missing responses."""
 
 
 def trial_table(
@@ -86,8 +90,8 @@ def trial_table(
     **Arguments:** `material`: select its rows; required if there are several. `source`: the file, for messages.
     `others`: keep the columns that hilbo does not use. `say`: called with the number of rows read so far. `note`:
     called with one sentence on each of: participants none of whose responses is fitted, two ids that may be one
-    participant's, ids that a spreadsheet has rounded; by default a warning. Raises `InputError`, and its subclass
-    `NothingToFitError` if no row is left.
+    participant's, ids that a spreadsheet has rounded, missing responses; by default a warning. Raises `InputError`, and
+    its subclass `NothingToFitError` if no row is left.
     """
     texts, pieces, rows, named = {}, [], 0, {}
     for text in cells:
@@ -104,25 +108,31 @@ def trial_table(
     table = pd.concat(pieces)
     del pieces
     _check_duplicates(table, source)
-    fitted = table.pop("_fitted")
+    fitted, absent = table.pop("_fitted"), table.pop("_missing")
+    missing = Missing.of(table["participant"][fitted], absent[fitted])
+    absent = absent.notna()
+    fitted &= ~absent
     counts = counted_flags(table[fitted], study.exclude_flags)
     fitted &= ~flagged(table, study.exclude_flags)
-    left, table = table[~fitted], table[fitted]
+    left, table = table[~fitted & ~absent], table[fitted]
     _check_blinded(table.pop("_blinded"), study, source)
     besides = ", or excluded by `exclude_flags`" if study.exclude_flags else ""
+    nothing = ", or missing" if study.missing else ""
     if table.empty:
-        raise NothingToFitError(f"{source}: has no rows to fit; all are warm-up, repeated or voided{besides}.")
+        raise NothingToFitError(f"{source}: has no rows to fit; all are warm-up, repeated or voided{nothing}{besides}.")
     table = of_material(table, material, source)
-    _note_the_absent(left, table, source if material is None else f"{source} ({material})", besides, note)
-    _note_doubtful_ids(list(table["participant"].unique()), source, note)
-    return TrialTable(_ordered(table), counts)
+    note_absent(left, table, source if material is None else f"{source} ({material})", besides, note)
+    note_doubtful_ids(list(table["participant"].unique()), source, note)
+    for sentence in missing.sentences:
+        note(f"{source}: {sentence}")
+    return TrialTable(_ordered(table), counts, missing)
 
 
 def joined(tables: Sequence[TrialTable]) -> TrialTable:
     """Several checked tables of one study as one, sorted again; flag counts are added. Duplicates are not looked
     for."""
     rows = pd.concat([table.rows for table in tables], ignore_index=True)
-    return TrialTable(_ordered(rows), added(table.flags for table in tables))
+    return TrialTable(_ordered(rows), added(t.flags for t in tables), Missing.added(t.missing for t in tables))
 
 
 def _ordered(table: pd.DataFrame) -> pd.DataFrame:
@@ -135,36 +145,9 @@ def _ordered(table: pd.DataFrame) -> pd.DataFrame:
     return table.iloc[np.lexsort(places)]
 
 
-def _note_the_absent(
-    left: pd.DataFrame, table: pd.DataFrame, source: str, besides: str, note: Callable[[str], object]
-) -> None:
-    """Call `note` with one sentence on participants who occur in `left` (excluded rows) but not in `table` (fitted
-    rows); no call if there are none. `besides`: further reason for exclusion, for the sentence."""
-    kept = set(table["participant"].unique())
-    absent = [str(name) for name in left["participant"].unique() if name not in kept]
-    if absent:
-        who = ", ".join(absent[:_NAMED]) + (f" and {len(absent) - _NAMED} more" if len(absent) > _NAMED else "")
-        answers = f"{len(left)} answers are" if len(left) > 1 else "1 answer is"
-        have = "has" if len(absent) == 1 else "have"
-        also = f"voided, warm-up or repeated{besides}, and not fitted"
-        note(f"{source}: {answers} {also}; {who} {have} no other answer in it.")
-
-
-def _note_doubtful_ids(names: list[str], source: str, note: Callable[[str], object]) -> None:
-    """Call `note` with a sentence on two ids that may be one participant, and on ids that may be several."""
-    if pair := alike(names):
-        words = 'capitals, blanks, leading zeros or ".0" only'
-        note(f"{source}: {pair} differ in {words}; they are taken for two people.")
-    if rounded := [name for name in names if is_rounded(name)]:
-        note(
-            f'{source}: participant "{rounded[0]}" looks like a number that a spreadsheet has rounded, and may be'
-            " several people; export the ids as text."
-        )
-
-
 def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
     """Check one piece of text cells; returns it with `trial` and parameters as numbers, and the new columns `category`,
-    `_blinded` and `_fitted` (Boolean: whether the row is to be fitted).
+    `_blinded`, `_missing` and `_fitted` (Boolean: whether the row is to be fitted, if it has a response).
 
     `texts` is a cache in which equal texts become one object; it is extended. `others`: keep columns that hilbo does
     not use. Raises `InputError`.
@@ -184,7 +167,9 @@ def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, te
     check_texts(text, source, numeric | {"response"})
     for parameter in study.space.parameters:
         table[parameter.name] = parameter_values(text, parameter, source)
-    table["category"] = _categories(text["response"], study.responses, source)
+    table["_missing"] = missing_labels(text["response"], study.missing)
+    given = _categories(text["response"][table["_missing"].isna()], study.responses, source)
+    table["category"] = given.reindex(text.index, fill_value=_NONE)
     table["_blinded"] = text["unblinded"].str.strip().str.lower().isin(_FALSE) if "unblinded" in text else True
     table["_fitted"] = ~boolean_column(text, "voided", source) & (is_fitted(text["phase"]) if "phase" in text else True)
     return pd.DataFrame(table, index=text.index)

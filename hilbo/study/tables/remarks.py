@@ -1,0 +1,38 @@
+"""Remarks on the participants of a trial table, as sentences that `note` is called with."""
+
+from collections.abc import Callable
+
+import pandas as pd
+
+from hilbo.study.formats.cell_text import alike, is_rounded
+
+__all__ = ["note_absent", "note_doubtful_ids"]
+
+_NAMED = 6  # people of whom a remark says the names
+
+
+def note_absent(
+    left: pd.DataFrame, table: pd.DataFrame, source: str, besides: str, note: Callable[[str], object]
+) -> None:
+    """Call `note` with one sentence on participants who occur in `left` (excluded rows) but not in `table` (fitted
+    rows); no call if there are none. `besides`: further reason for exclusion, for the sentence."""
+    kept = set(table["participant"].unique())
+    absent = [str(name) for name in left["participant"].unique() if name not in kept]
+    if absent:
+        who = ", ".join(absent[:_NAMED]) + (f" and {len(absent) - _NAMED} more" if len(absent) > _NAMED else "")
+        answers = f"{len(left)} answers are" if len(left) > 1 else "1 answer is"
+        have = "has" if len(absent) == 1 else "have"
+        also = f"voided, warm-up or repeated{besides}, and not fitted"
+        note(f"{source}: {answers} {also}; {who} {have} no other answer in it.")
+
+
+def note_doubtful_ids(names: list[str], source: str, note: Callable[[str], object]) -> None:
+    """Call `note` with a sentence on two ids that may be one participant, and on ids that may be several."""
+    if pair := alike(names):
+        words = 'capitals, blanks, leading zeros or ".0" only'
+        note(f"{source}: {pair} differ in {words}; they are taken for two people.")
+    if rounded := [name for name in names if is_rounded(name)]:
+        note(
+            f'{source}: participant "{rounded[0]}" looks like a number that a spreadsheet has rounded, and may be'
+            " several people; export the ids as text."
+        )
