@@ -188,6 +188,7 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
     ),
     ('inference = "laplace"', 'inference = "vb"', '30: gp.inference is "vb"; it must be "laplace", "ep", "ep_correct'),
     ('"similar", ', '"close", ', '4: study.responses is ["different", "close", "close"]; it must not have one label '),
+    ('"similar", ', '"Close", ', '4: study.responses has "Close" and "close", which differ in capitals or blanks only'),
     ('["different", "similar", "close"]', '["close"]', '4: study.responses is ["close"]; it must be a list of two '),
     ('"memory foam"', '""', '3: study.name is ""; it must be a text; write for example name = "memory foam".'),
     ("high = 0.99", "high = 0.01", "15: parameters.alpha.low is 0.01; it must be below high = 0.01."),

@@ -22,6 +22,7 @@ from hilbo.study.file.schema import (
     LevelsTable,
     ParameterTable,
     RendererTable,
+    StudyTable,
     Tables,
 )
 from hilbo.study.formats.cell_text import check_text
@@ -157,15 +158,8 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
     """Raise `InputError` for tables that contradict each other or the parameters: responses, selection, reserved names,
     session, stimulus, simulation, [gp] and random effect."""
     labels, selection = tables.study.responses, tables.selection
-    if len(set(labels)) < len(labels):
-        raise InputError(f"study.responses is {shown(labels)}; it must not have one label twice.")
-    known = {label.strip().casefold() for label in labels}
-    for label in tables.study.missing:
-        if label.strip().casefold() in known:
-            raise InputError(f"study.missing has {shown(label)}, which is a response too; leave it out of one of them.")
+    _check_labels(tables.study)
     goal = tables.study.goal
-    if goal and goal not in labels:
-        raise InputError(f"study.goal is {shown(goal)}; it must be one of the responses, {', '.join(labels)}.")
     if goal in labels[1:-1] and selection.acquisition == "log_ei":
         raise InputError(
             'selection.acquisition is "log_ei", which has no form for a goal between other responses; use "ucb".'
@@ -204,6 +198,25 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
             f'random_effect.column is "{column}", which has a meaning of its own; name another column of the'
             " answers' table, such as the clip or the day."
         )
+
+
+def _check_labels(study: StudyTable) -> None:
+    """Raise `InputError` for two responses that are the same, or differ in capitals or blanks only, for a missing
+    response that is one, and for a goal that is none."""
+    labels = study.responses
+    if len(set(labels)) < len(labels):
+        raise InputError(f"study.responses is {shown(labels)}; it must not have one label twice.")
+    known: dict[str, str] = {}
+    for label in labels:
+        other = known.setdefault(label.strip().casefold(), label)
+        if other != label:
+            pair = f"{shown(other)} and {shown(label)}"
+            raise InputError(f"study.responses has {pair}, which differ in capitals or blanks only; rename one.")
+    for label in study.missing:
+        if label.strip().casefold() in known:
+            raise InputError(f"study.missing has {shown(label)}, which is a response too; leave it out of one of them.")
+    if study.goal and study.goal not in labels:
+        raise InputError(f"study.goal is {shown(study.goal)}; it must be one of the responses, {', '.join(labels)}.")
 
 
 def _check_gp(table: GPTable, rule: str, count: int) -> None:
