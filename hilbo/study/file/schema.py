@@ -30,6 +30,7 @@ __all__ = [
     "RendererTable",
     "ReportTable",
     "Selection",
+    "StudyTable",
     "Tables",
     "ValidationTable",
 ]
