@@ -1,4 +1,4 @@
-"""Do the intervals of `hilbo robustness --pilot` hold what many people would give? Coverage on simulated pilots.
+"""Coverage of the intervals of `hilbo robustness --pilot`, and regret of studies with its hyperparameters; simulated.
 
     python benchmarks/pilot.py FILE [--studies 40] [--first 1000]
     python benchmarks/pilot.py FILE --write
@@ -62,7 +62,7 @@ def main():
 
 
 def estimated(name, seed, count):
-    """A population's study, a cohort of so many people, and their optimised hyperparameters."""
+    """A population's study, a cohort of `count` participants, and their optimised hyperparameters."""
     population = Places(preset=name)
     study = population.study
     cohort = cohort_from(simulate_study(study, population.scene(study, count, seed).persons, seed))
@@ -113,28 +113,28 @@ def regrets(name, seed, gp):
 
 
 def table(rows):
-    """Coverage of the intervals and how far they reach, the median factor or half width; the estimates over those of
-    many people; and the regrets of studies that use them."""
+    """Bias, coverage and width of the intervals of each hyperparameter; and the regrets of studies that use them."""
     lines = []
     for count in COUNTS:
         those = [row for row in rows if row["people"] == count]
         low, high = np.moveaxis(np.array([row["intervals"] for row in those]), 2, 0)
         truth, found = (np.array([row[name] for row in those]) for name in ("reference", "estimates"))
         held = 100 * np.mean((low <= truth) & (truth <= high), axis=0)
-        factors = np.median(np.sqrt(high[:, :2] / low[:, :2]), axis=0)
-        widths = np.median((high - low)[:, 2:] / 2, axis=0)
-        off = [f"{ratio:.2f}" for ratio in np.median(found[:, :2] / truth[:, :2], axis=0)]
+        ratios = np.median(found[:, :2] / truth[:, :2], axis=0)
+        off = [f"× {ratio:.2f}" for ratio in ratios]
         off += [f"{by:+.2f}" for by in np.median(found[:, 2:] - truth[:, 2:], axis=0)]
-        reach = [f"a factor {factor:.2g}" for factor in factors] + [f"± {width:.2g}" for width in widths]
-        cells = [f"{o}; {h:.0f} % ({r})" for o, h, r in zip(off, held, reach, strict=True)]
-        lines.append([str(count), str(len(those)), *cells])
+        reach = [f"×/÷ {factor:.2g}" for factor in np.median(np.sqrt(high[:, :2] / low[:, :2]), axis=0)]
+        reach += [f"± {width:.2g}" for width in np.median((high - low)[:, 2:] / 2, axis=0)]
+        for name, *cells in zip(VALUES, off, (f"{h:.0f} %" for h in held), reach, strict=True):
+            lines.append([name, str(count), str(len(those)), *cells])
     regret = {way: np.array([row["regret"][way] for row in those]) for way in ("paper", "pilot", "learnt-2")}
     seeds = np.array([row["seed"] for row in those])
     cells = [f"{value.mean():.3f}" for value in regret.values()]
     cells += [ends(regret[way] - regret["paper"], seeds) for way in ("pilot", "learnt-2")]
-    heads = ["studies", "bcm, the paper's", "bcm, the pilot's", "learnt-2", "pilot less paper", "learnt-2 less paper"]
+    heads = ["studies", "bcm, paper", "bcm, pilot", "learnt-2", "pilot minus paper", "learnt-2 minus paper"]
     found = lined(heads, [[str(len(those)), *cells]])
-    return lined(["people", "pilots", *VALUES], lines) + "\n\n" + found
+    heads = ["hyperparameter", "participants", "pilots", "median bias", "coverage", "median half-width"]
+    return lined(heads, lines) + "\n\n" + found
 
 
 if __name__ == "__main__":

@@ -168,17 +168,27 @@ def test_the_study_files_on_the_page_are_good():
         assert checked(tomllib.loads(block), "page", lambda file: file.name)
 
 
-def test_the_first_study_is_that_of_its_script():
-    """The commands, words and figures; the script runs all of them, a deep test those that take seconds."""
-    made, text = script("first_study"), (DOCS / "guides" / "first-study.md").read_text(encoding="utf-8")
-    commands = re.findall(r"^```\n(hilbo .*)\n```", text, re.M)
-    assert commands == [step.command for step in made.STEPS]
-    for step in made.STEPS:
+def _commands(text):
+    """Commands of a page that its script runs: blocks of one command; sessions with a device are only shown."""
+    return [c for c in re.findall(r"^```\n(hilbo .*)\n```", text, re.M) if "--device PORT" not in c]
+
+
+def _check_page(made, steps):
+    """Commands, words and figures of a page are those of the steps of its script; no path of a machine is on it."""
+    text = made.PAGE.read_text(encoding="utf-8")
+    assert _commands(text) == [step.command for step in steps if step.command]
+    for step in steps:
         assert step.words in text
         for name, caption in step.figures:
             figure = name.replace("/", "-")
-            assert f"![{caption}](first-study/{figure})" in text and (made.FIGURES / figure).is_file()
+            assert f"![{caption}]({made.FIGURES.name}/{figure})" in text and (made.FIGURES / figure).is_file()
     assert not re.search(r"/(tmp|root|home|work)/", text)
+
+
+def test_the_first_study_is_that_of_its_script():
+    """The script runs all of the commands, a deep test those that take seconds."""
+    made = script("first_study")
+    _check_page(made, made.STEPS)
 
 
 @pytest.mark.deep
@@ -196,17 +206,9 @@ def _skeleton(command):
 
 
 def test_the_haptic_study_is_that_of_its_script():
-    """The commands, words and figures; the script runs all of them."""
-    made, text = script("haptic_study"), (DOCS / "guides" / "haptic-study.md").read_text(encoding="utf-8")
-    steps = made.steps(made.FULL, made.LAB)
-    commands = re.findall(r"^```\n(hilbo .*)\n```", text, re.M)
-    assert [c for c in commands if "--device PORT" not in c] == [step.command for step in steps if step.command]
-    for step in steps:
-        assert step.words in text
-        for name, caption in step.figures:
-            figure = name.replace("/", "-")
-            assert f"![{caption}](haptic-study/{figure})" in text and (made.FIGURES / figure).is_file()
-    assert not re.search(r"/(tmp|root|home|work)/", text)
+    """The script runs all of the commands, a deep test those of a small study."""
+    made = script("haptic_study")
+    _check_page(made, made.steps(made.FULL, made.LAB))
 
 
 @pytest.mark.deep
@@ -214,8 +216,7 @@ def test_a_small_haptic_study_runs_by_the_commands_of_its_page(tmp_path):
     """Two people for each material, from the device to the report."""
     made, text = script("haptic_study"), (DOCS / "guides" / "haptic-study.md").read_text(encoding="utf-8")
     small = made.steps(made.SMALL, made.LAB)
-    commands = [c for c in re.findall(r"^```\n(hilbo .*)\n```", text, re.M) if "--device PORT" not in c]
-    assert [_skeleton(c) for c in commands] == [_skeleton(step.command) for step in small if step.command]
+    assert [_skeleton(c) for c in _commands(text)] == [_skeleton(step.command) for step in small if step.command]
     made.page(made.SMALL, made.LAB, tmp_path, tmp_path / "figures")
     report = json.loads((tmp_path / "report" / "result.json").read_text(encoding="utf-8"))
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")

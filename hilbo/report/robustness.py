@@ -89,7 +89,7 @@ def gp_table(content: Content) -> str:
     intervals = pilot["intervals"] if pilot else {}
     lines = ["[gp]"]
     if pilot:
-        lines[0] = f"[gp] # by the answers of {pilot['participants']} people; 95 % intervals by the jackknife over them"
+        lines[0] = f"[gp] # estimated from {pilot['participants']} participants; 95 % intervals: delete-one jackknife"
     for name in ("theta", "variance", "thresholds", "noise"):
         ends = ", ".join(f"{low:.3g} to {high:.3g}" for low, high in intervals.get(name, []))
         remark = f"95 %: {ends}" if ends else "as in the study file"

@@ -72,7 +72,7 @@ def test_a_pilot_prints_hyperparameters_that_a_study_file_takes(capsys, monkeypa
     table[table["participant"].isin(["V01", "V02", "V03"])].to_csv(tmp_path / "pilot.csv", index=False)
     what = "robustness", tmp_path / "pilot.csv", *VIDEO[1:], "--out", tmp_path / "pilot", "--pilot"
     code, printed, _ = run(capsys, monkeypatch, *what)
-    assert code == 0 and "by the answers of 3 people" in printed
+    assert code == 0 and "estimated from 3 participants" in printed
     given, content = tomllib.loads(printed)["gp"], json.loads((tmp_path / "pilot" / "result.json").read_text())
     for name, ends in content["pilot"]["intervals"].items():
         values = np.atleast_1d(given[name])

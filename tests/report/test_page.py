@@ -197,5 +197,5 @@ def test_the_card_of_a_page_has_the_answer(region):
     said = " ".join(text.split())
     assert "nan" not in said and "Individual error: 12.5 %" in said and "80 % (95 % interval 60 % to 90 %)" in said
     assert ("from wood or tin" in said and "0.2 to 0.4" in said) == (region is not None)
-    assert ("Located: the region is 10 %" in said) == (region is not None)
+    assert ("Located: the credible region covers 10 % of the feasible region" in said) == (region is not None)
     assert ("region was not computed" in said) == (region is None)

@@ -72,7 +72,7 @@ def test_a_goal_that_nobody_answered_is_named():
     assert goal_sentences(study, cohort.trials) == []
     others = eqx.tree_at(lambda t: t.mask, cohort.trials, cohort.trials.mask & (cohort.trials.q == 0))
     (sentence,) = goal_sentences(study, others)
-    assert sentence.startswith('Nobody answered "good"')
+    assert sentence.startswith('No response is "good"')
 
 
 def test_a_row_of_a_table_has_the_same_in_a_few_words():

@@ -212,7 +212,7 @@ def test_ids_that_may_be_one_person_are_two_with_a_warning(tmp_path, pair):
 
 
 def test_ids_that_a_spreadsheet_rounded_are_named(tmp_path):
-    with pytest.warns(InputRemark, match='participant "9.45E12" looks like a number that a spreadsheet has rounded'):
+    with pytest.warns(InputRemark, match='participant "9.45E12" looks like a number rounded by a spreadsheet'):
         read_trials(written(tmp_path, HEADER + "9.45E12,1,close,1,2\nE12,1,close,1,2\n"), study())
 
 
@@ -551,7 +551,7 @@ def test_missing_responses_are_counted_and_not_fitted(tmp_path):
     rows = [("A", "close"), ("A", " NA "), ("A", "similar"), ("B", "-1"), ("B", "close"), ("B", "NA"), ("B", "")]
     lines = "".join(f"{name},{i},{cell},1,2\n" for i, (name, cell) in enumerate(rows, 1))
     path = written(tmp_path, HEADER + lines)
-    with pytest.warns(InputRemark, match=r'4 of 7 answers are missing \("NA" 2, "-1" 1, "" 1\) and not fitted'):
+    with pytest.warns(InputRemark, match=r'4 of 7 responses are missing \("NA" 2, "-1" 1, "" 1\) and not fitted'):
         table = trial_table(cell_pieces(path), of.file, source="t.csv")
     assert table.rows["response"].tolist() == ["close", "similar", "close"] and (table.rows["category"] >= 0).all()
     assert table.missing.content() == {

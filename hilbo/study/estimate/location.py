@@ -57,7 +57,7 @@ def goal_sentences(study: Study, trials: Trials) -> list[str]:
     """A warning if none of the responses is the goal; else an empty list. `trials`: those of the map, masked."""
     if np.any((np.asarray(trials.q) == study.goal.category) & np.asarray(trials.mask)):
         return []
-    return [f'Nobody answered "{study.goal_label}": where it is most probable is an extrapolation of the model.']
+    return [f'No response is "{study.goal_label}": its probability is an extrapolation of the model.']
 
 
 def location_sentences(

@@ -46,7 +46,7 @@ class Missing(NamedTuple):
         who = ", ".join(f"{name} {count}" for name, count in first) + (f" and {more} more" if more else "")
         total = sum(self.labels.values())
         verb = "is" if total == 1 else "are"
-        return [f"{total} of {self.rows} answers {verb} missing ({kinds}) and not fitted, by participant: {who}."]
+        return [f"{total} of {self.rows} responses {verb} missing ({kinds}) and not fitted; by participant: {who}."]
 
     def content(self) -> dict[str, Any]:
         """The counts as a dict for result.json."""
@@ -55,5 +55,7 @@ class Missing(NamedTuple):
 
 def missing_labels(cells: "pd.Series[str]", labels: Collection[str]) -> "pd.Series[Any]":
     """Series of the label of each cell that is one of `labels`, blanks around it not considered; None elsewhere."""
+    if not labels:
+        return pd.Series(None, cells.index, dtype=object)
     plain = cells.str.strip().astype(object)
     return plain.where(plain.isin([label.strip() for label in labels]), None)

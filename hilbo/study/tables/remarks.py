@@ -27,12 +27,12 @@ def note_absent(
 
 
 def note_doubtful_ids(names: list[str], source: str, note: Callable[[str], object]) -> None:
-    """Call `note` with a sentence on two ids that may be one participant, and on ids that may be several."""
+    """Call `note` with a sentence on two ids that may belong to one participant, and on one that several may share."""
     if pair := alike(names):
         words = 'capitals, blanks, leading zeros or ".0" only'
-        note(f"{source}: {pair} differ in {words}; they are taken for two people.")
+        note(f"{source}: {pair} differ in {words}; they are treated as two participants.")
     if rounded := [name for name in names if is_rounded(name)]:
         note(
-            f'{source}: participant "{rounded[0]}" looks like a number that a spreadsheet has rounded, and may be'
-            " several people; export the ids as text."
+            f'{source}: participant "{rounded[0]}" looks like a number rounded by a spreadsheet; several'
+            " participants may share it: export the ids as text."
         )
