@@ -15,10 +15,12 @@ from hilbo.errors import InputError
 from hilbo.mechanics.span import STATES, Memory
 from hilbo.numerics.host import namespace_of
 
-__all__ = ["MOST_PARAMETERS", "Box", "Constraint", "Mechanics", "Parameter"]
+__all__ = ["MOST_PARAMETERS", "Box", "Constraint", "End", "Mechanics", "Parameter"]
 
 
 MOST_PARAMETERS = 8
+End = Literal["low", "high"]
+"""An end of a parameter's range."""
 _SMALLEST = 2.0**-1022  # of the normal floating-point numbers: those below lose digits, and JAX takes them for 0
 
 
@@ -37,6 +39,7 @@ class Parameter:
 
     `integer`: only whole numbers are allowed. `levels`: names of the unordered levels of a categorical parameter, which
     ranges from 0 to their number minus 1; `correlation`: prior correlation of the latent score between two levels.
+    `natural_ends`: ends of the range ("low", "high") beyond which nothing exists.
     """
 
     name: str
@@ -47,6 +50,7 @@ class Parameter:
     integer: bool = False
     levels: tuple[str, ...] = ()
     correlation: float = 0.5
+    natural_ends: tuple[End, ...] = ()
 
     def __post_init__(self):
         path = f"parameters.{self.name}"

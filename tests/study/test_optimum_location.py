@@ -9,6 +9,7 @@ from studies import PLAIN, answered, plain_study
 
 from hilbo.study.config import Study
 from hilbo.study.estimate.location import goal_sentences, location_notes, location_sentences, truth_sentence
+from hilbo.study.file.columns import meanings
 
 STUDY = Study.load("hilbo/data/paper.toml")
 SD, ASKED = jnp.asarray(0.3), jnp.asarray(0.25)
@@ -21,6 +22,21 @@ def test_inside_and_known_there_is_nothing_to_say():
 def test_the_edge_of_a_range_is_named():
     (sentence,) = location_sentences(STUDY, jnp.array([0.1, 0.2, 0.0]), SD, ASKED)
     assert sentence.startswith("The optimum lies at the lowest alpha that was searched (0.01):")
+
+
+def test_a_natural_end_is_named_without_the_remark_on_what_is_beyond():
+    numbers = PLAIN["parameters"] | {"u": PLAIN["parameters"]["u"] | {"natural_ends": ["low"]}}
+    study = Study.from_dict(PLAIN | {"parameters": numbers})
+    (sentence,) = location_sentences(study, jnp.array([0.0, 0.5]), SD, ASKED)
+    assert sentence == "The optimum lies at the natural end of u (0), beyond which nothing exists."
+    assert location_notes(study, jnp.array([0.0, 0.5]), SD, ASKED) == ["at the natural end of u (0)"]
+    far, natural = location_sentences(study, jnp.array([0.0, 1.0]), SD, ASKED)
+    assert "the highest v that was searched (20)" in far and natural == sentence
+    (sentence,) = location_sentences(study, jnp.array([1.0, 0.5]), SD, ASKED)
+    assert "the highest u that was searched (1): whether people" in sentence
+    assert study.file.meaning == Study.from_dict(PLAIN).file.meaning
+    assert "natural end of a range" in meanings("optima", study.file.space)["location"][1]
+    assert "natural" not in meanings("optima", Study.from_dict(PLAIN).file.space)["location"][1]
 
 
 def test_the_border_of_the_passive_set_is_named():

@@ -26,6 +26,8 @@ class _Edges(NamedTuple):
     """The limits that an optimum lies on: ends of the search ranges, constraints, and limits of the renderer."""
 
     ends: list[str]
+    natural: list[str]
+    """Ends beyond which nothing exists."""
     constraints: list[str]
     border: list[tuple[str, str, tuple[str, str]]]
     """Parameter, direction ("higher" or "lower") that the renderer does not allow there, and the limit in words, for a
@@ -74,6 +76,8 @@ def location_sentences(
             f"The optimum lies at {' and '.join(edges.ends)}: whether people would like what is beyond is not known"
             " from this study."
         )
+    if edges.natural:
+        sentences.append(f"The optimum lies at {' and '.join(edges.natural)}, beyond which nothing exists.")
     if edges.constraints:
         sentences.append(
             f"The optimum lies on the study's constraint {' and '.join(edges.constraints)}: whether people would like"
@@ -101,7 +105,7 @@ def location_notes(
     `sd`, `asked`: the map's standard deviation at x, and its largest variance at a tested stimulus (None: not checked).
     """
     edges = _edges(study, np.asarray(x))
-    notes = [f"at {end}" for end in edges.ends]
+    notes = [f"at {end}" for end in (*edges.ends, *edges.natural)]
     notes += [f"on the constraint {words}" for words in edges.constraints]
     notes += [f"{name} could not be {way} {by}" for name, way, (_, by) in edges.border]
     if asked is not None and _extrapolates(sd, asked):
@@ -116,13 +120,15 @@ def _extrapolates(sd: Float[Array, ""], asked: Float[Array, ""]) -> bool:
 
 def _edges(study: Study, x: Float[np.ndarray, " d"]) -> _Edges:
     """The limits within 1e-6 of the point x (d,) of the unit cube; parameters with levels have none."""
-    inner, edges = np.asarray(study.space.to_box(x)), _Edges([], _constraints(study, x), [])
+    inner, edges = np.asarray(study.space.to_box(x)), _Edges([], [], _constraints(study, x), [])
     for i, parameter in enumerate(study.space.parameters):
         if parameter.levels:
             continue
         unit = f" {parameter.unit}" if parameter.unit else ""
-        for place, end, word in ((0.0, parameter.low, "lowest"), (1.0, parameter.high, "highest")):
-            if abs(x[i] - place) < _AT:
+        for place, end, word, key in ((0.0, parameter.low, "lowest", "low"), (1.0, parameter.high, "highest", "high")):
+            if abs(x[i] - place) < _AT and key in parameter.natural_ends:
+                edges.natural.append(f"the natural end of {parameter.name} ({end:g}{unit})")
+            elif abs(x[i] - place) < _AT:
                 edges.ends.append(f"the {word} {parameter.name} that was searched ({end:g}{unit})")
             elif abs(inner[i] - place) < _AT:
                 beyond = x.copy()

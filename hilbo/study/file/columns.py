@@ -49,14 +49,17 @@ def meanings(table: str, space: Box) -> dict[str, Meaning]:
             columns[presented_column(side, name)] = (unit, f"value confirmed as presented on side {side}{levels}")
     mechanics = space.mechanics
     damped = mechanics is not None and mechanics.effective_damping is not None
-    here = _by_the_study(bool(space.constraints), mechanics is not None, damped)
+    natural = any(p.natural_ends for p in space.parameters)
+    here = _by_the_study(natural, bool(space.constraints), mechanics is not None, damped)
     return columns | COLUMNS[table] | {name: here[name] for name in here if name in COLUMNS[table]}
 
 
-def _by_the_study(constrained: bool, rendered: bool, damped: bool) -> dict[str, Meaning]:
+def _by_the_study(natural: bool, constrained: bool, rendered: bool, damped: bool) -> dict[str, Meaning]:
     """Meanings of the columns `low_end` and `location`, whose possible values depend on what the study has:
-    constraints, a renderer, a range of effective damping."""
+    natural ends, constraints, a renderer, a range of effective damping."""
     ends, places = ["another response", "the range"], ["range limit"]
+    if natural:
+        places = [*places, "natural end of a range"]
     if constrained:
         ends, places = [*ends, "a constraint"], [*places, "constraint boundary"]
     if rendered:

@@ -25,8 +25,9 @@ MEANING = (
     "session.texts.question_preferred",
 )
 """Keys, with all keys below them, that determine what a response means, but for `FREE`."""
-FREE = {"stimulus": ("within", "silence"), "parameters": ("correlation",)}
-"""Keys below them that do not: how long a presenter is waited for, and a hyperparameter of the prior."""
+FREE = {"stimulus": ("within", "silence"), "parameters": ("correlation", "natural_ends")}
+"""Keys below them that do not: how long a presenter is waited for, a hyperparameter of the prior, and whether anything
+exists beyond a range."""
 
 
 def meaning_part(tables: Content) -> Content:

@@ -7,6 +7,7 @@ import msgspec
 
 from hilbo.mechanics.span import Memory
 from hilbo.population.rules.registry import DEFAULT, RULES, RuleName
+from hilbo.search.box import End
 from hilbo.study.file.fields import NotNegative as _NotNegative
 from hilbo.study.file.fields import Number as _Number
 from hilbo.study.file.fields import Positive as _Positive
@@ -58,14 +59,18 @@ class StudyTable(_Table, frozen=True):
     ] = ()
 
 
+_Ends = Annotated[tuple[End, ...], msgspec.Meta(max_length=2), _text('a list of "low", "high" or both', '["low"]')]
+
+
 class ParameterTable(_Table, frozen=True):
-    """[parameters.NAME]: a numeric parameter."""
+    """[parameters.NAME]: a numeric parameter. `natural_ends`: ends of the range beyond which nothing exists."""
 
     low: _Number
     high: _Number
     unit: Annotated[str, _text("a text", '"N/mm"')] = ""
     scale: Annotated[Literal["linear", "log"], _text('"linear" or "log"', '"linear"')] = "linear"
     integer: Annotated[bool, _text("true or false", "true")] = False
+    natural_ends: _Ends = ()
 
 
 class LevelsTable(_Table, frozen=True):
