@@ -23,8 +23,8 @@ def init(
     parameter: Annotated[
         list[str] | None,
         typer.Option(
-            help="NAME=LOW:HIGH:UNIT, with :log behind it if steps are ratios, or :integer; or NAME=LEVEL,LEVEL,LEVEL."
-            " Once for each."
+            help="NAME=LOW:HIGH:UNIT, with :log behind it if steps are ratios, or :integer; or NAME=LEVEL,LEVEL,LEVEL;"
+            " or NAME=LOW<MEDIUM<HIGH for levels in an order. Once for each."
         ),
     ] = None,
     constraint: Annotated[

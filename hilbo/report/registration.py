@@ -84,7 +84,9 @@ def _model(study: StudyFile) -> str:
         "noise": gp.noise,
     }
     stated = [f"{name} {_value(value)}" for name, value in given.items() if value is not None]
-    alike = [f"correlation {p.correlation:g} of any two levels of {p.name}" for p in study.space.parameters if p.levels]
+    alike = [
+        f"correlation {p.correlation:g} of any two levels of {p.name}" for p in study.space.parameters if p.categorical
+    ]
     return ", ".join([f"inference {gp.inference}", *stated, *alike]) + (
         "" if len(stated) == len(given) else ", the rest learnt"
     )

@@ -193,7 +193,7 @@ def _correlation(study: Study) -> float:
     any.
     """
     kernel, middle = study.gp.kernel, np.full(study.space.dim, 0.5)
-    numeric = [i for i, parameter in enumerate(study.space.parameters) if not parameter.levels]
+    numeric = [i for i, parameter in enumerate(study.space.parameters) if not parameter.categorical]
     steps = _TENTH * np.eye(study.space.dim)[numeric]
     pairs = [kernel(jnp.asarray(middle), jnp.asarray(middle + step)) / kernel.variance for step in steps]
     return float(np.median(pairs)) if pairs else 1.0

@@ -13,8 +13,8 @@ __all__ = ["differences", "levels_of", "middle_of", "nrmse"]
 
 
 def levels_of(parameters: Sequence[Parameter]) -> tuple[int, ...]:
-    """Number of unordered levels of each parameter, 0 for a numeric one; an empty tuple if all are numeric."""
-    counts = tuple(p.steps if p.levels else 0 for p in parameters)
+    """Number of unordered levels of each parameter, 0 for a numeric or ordered one; an empty tuple if all are 0."""
+    counts = tuple(p.steps if p.categorical else 0 for p in parameters)
     return counts if any(counts) else ()
 
 

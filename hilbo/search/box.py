@@ -1,8 +1,8 @@
 """Definition of a search space: named parameters with units or levels, linear constraints, and the renderer.
 
 Numbers only, checked against each other; imports no JAX. `space` searches in it and knows its passive part. A parameter
-is continuous, integer, or categorical (unordered levels). In physical numbers a level is its position in the list, from
-0; `Parameter.shown` and `Parameter.number` convert to its text and back.
+is continuous, integer, or has ordered or unordered levels. In physical numbers a level is its position in the list,
+from 0; `Parameter.shown` and `Parameter.number` convert to its text and back.
 """
 
 import math
@@ -14,6 +14,7 @@ from jaxtyping import Float, Real
 from hilbo.errors import InputError
 from hilbo.mechanics.span import STATES, Memory
 from hilbo.numerics.host import namespace_of
+from hilbo.search.levels import check_levels, index_at, position_of
 
 __all__ = ["MOST_PARAMETERS", "Box", "Constraint", "End", "Mechanics", "Parameter"]
 
@@ -24,21 +25,13 @@ End = Literal["low", "high"]
 _SMALLEST = 2.0**-1022  # of the normal floating-point numbers: those below lose digits, and JAX takes them for 0
 
 
-def _reads_as_a_number(text: str) -> bool:
-    """Whether Python can parse the text as a number; "nan" and "inf" count."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 @dataclass(frozen=True)
 class Parameter:
     """Named parameter, from `low` to `high` in `unit`; `scale` defines its mapping to [0, 1].
 
-    `integer`: only whole numbers are allowed. `levels`: names of the unordered levels of a categorical parameter, which
-    ranges from 0 to their number minus 1; `correlation`: prior correlation of the latent score between two levels.
+    `integer`: only whole numbers are allowed. `levels`: names of levels; the parameter then ranges from 0 to their
+    number minus 1. Of unordered ones `correlation` is the prior correlation of the latent score between two of them;
+    `ordered` ones lie on the unit scale, equally spaced or at the positions `at`.
     `natural_ends`: ends of the range ("low", "high") beyond which nothing exists.
     """
 
@@ -51,11 +44,13 @@ class Parameter:
     levels: tuple[str, ...] = ()
     correlation: float = 0.5
     natural_ends: tuple[End, ...] = ()
+    ordered: bool = False
+    at: tuple[float, ...] = ()
 
     def __post_init__(self):
         path = f"parameters.{self.name}"
         if self.levels:
-            self._check_levels(path)
+            check_levels(path, self.levels, self.correlation, self.ordered, self.at)
         if not (math.isfinite(self.low) and math.isfinite(self.high)):
             raise InputError(f"{path} runs from {self.low} to {self.high}, both ends must be finite numbers.")
         if not self.low < self.high:
@@ -74,28 +69,14 @@ class Parameter:
                 raise InputError(f"{path}.{key} is {end}; it must be a whole number where integer = true.")
 
     @classmethod
-    def of_levels(cls, name: str, levels: tuple[str, ...], correlation: float = 0.5) -> "Parameter":
-        """Categorical parameter with unordered levels. Raises `InputError` for invalid level names or `correlation`."""
-        return cls(name, 0.0, len(levels) - 1.0, levels=levels, correlation=correlation)
+    def of_levels(cls, name: str, levels: tuple[str, ...], correlation: float = 0.5, **others: Any) -> "Parameter":
+        """Parameter with levels, by default unordered; `others`: its other fields. Raises `InputError` if invalid."""
+        return cls(name, 0.0, len(levels) - 1.0, levels=levels, correlation=correlation, **others)
 
-    def _check_levels(self, path: str) -> None:
-        """Raise `InputError` for too few, repeated, unprintable or numeric level names, and an invalid correlation."""
-        if len(self.levels) < 2:
-            raise InputError(f"{path}.levels is {list(self.levels)}; it must have two levels or more.")
-        twice = next((level for level in self.levels if self.levels.count(level) > 1), None)
-        if twice is not None:
-            raise InputError(f'{path}.levels has "{twice}" twice, give each level once.')
-        unseen = next((level for level in self.levels if level != level.strip() or not level.isprintable()), None)
-        if unseen is not None:
-            raise InputError(f"{path}.levels has {unseen!r}, a level is a text without blanks around it, on one line.")
-        numeral = next((level for level in self.levels if _reads_as_a_number(level)), None)
-        if numeral is not None:
-            raise InputError(
-                f'{path}.levels has "{numeral}", which reads as a number; name it otherwise, or give low, high and'
-                " integer = true."
-            )
-        if not 0 < self.correlation < 1:
-            raise InputError(f"{path}.correlation is {self.correlation}; it must be between 0 and 1.")
+    @property
+    def categorical(self) -> bool:
+        """Whether the parameter has levels without an order, so that its unit scale has no distances."""
+        return bool(self.levels) and not self.ordered
 
     @property
     def discrete(self) -> bool:
@@ -143,7 +124,7 @@ class Parameter:
     def range_words(self) -> str:
         """Text of the allowed values, such as "a number from 0 to 5 mm" or "one of red, green"."""
         if self.levels:
-            return "one of " + ", ".join(self.levels)
+            return "one of " + (" < " if self.ordered else ", ").join(self.levels)
         kind = "a whole number" if self.integer else "a number"
         return f"{kind} from {self.low:g} to {self.high:g} {self.unit}".rstrip()
 
@@ -159,6 +140,8 @@ class Parameter:
 
     def to_unit(self, value: Real[Any, "..."]) -> Float[Any, "..."]:
         """Map physical values (array) to [0, 1] on the parameter's scale; exact at both ends, not clipped."""
+        if self.at:
+            return position_of(self.at, value)
         xp = namespace_of(value)
         if self.scale == "log":
             above, below = xp.log1p((value - self.low) / self.low), xp.log1p((self.high - value) / value)
@@ -172,6 +155,8 @@ class Parameter:
 
         A discrete parameter is rounded to its nearest value.
         """
+        if self.at:
+            return index_at(self.at, unit)
         xp = namespace_of(unit)
         if self.scale == "log":
             ratio = self.high / self.low
@@ -249,7 +234,7 @@ class Box:
     """Named parameters, optional `mechanics` of the renderer, and linear constraints.
 
     With `mechanics` the parameters must include K1 (N/mm), B1 (N·s^α/mm) and alpha, in any order. `constraints` may not
-    involve categorical parameters. Raises `InputError` for invalid definitions.
+    involve parameters with levels. Raises `InputError` for invalid definitions.
     """
 
     parameters: tuple[Parameter, ...]
@@ -271,7 +256,7 @@ class Box:
             self._check_constraint(constraint, f"constraints.{number}")
 
     def _check_constraint(self, constraint: Constraint, path: str) -> None:
-        """Raise `InputError` for an invalid constraint, or one on a categorical parameter. `path` begins the text."""
+        """Raise `InputError` for an invalid constraint, or one on a parameter with levels. `path` begins the text."""
         for name, weight in constraint.terms:
             if name not in self.names:
                 raise InputError(

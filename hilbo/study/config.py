@@ -118,8 +118,8 @@ def _gp(file: StudyFile) -> tuple[OrdinalGP, Stated]:
     prior's median for each hyperparameter that is not specified; for other methods only levels are recorded as
     specified."""
     table, parameters = file.gp, file.space.parameters
-    numbers = sum(not p.levels for p in parameters)
-    levels = tuple(Levels(p.steps, p.correlation) if p.levels else None for p in parameters)
+    numbers = sum(not p.categorical for p in parameters)
+    levels = tuple(Levels(p.steps, p.correlation) if p.categorical else None for p in parameters)
     levels = levels if numbers < len(parameters) else ()
     theta, variance, thresholds, noise = table.theta, table.variance, table.thresholds, table.noise
     if RULES[file.rule].learns:

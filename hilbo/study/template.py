@@ -27,7 +27,7 @@ _DEVICE = (
     Parameter("B1", 0.001, 32.0, "N.s^alpha/mm"),
     Parameter("alpha", 0.01, 0.99),
 )
-_FORM = "NAME=LOW:HIGH, NAME=LOW:HIGH:UNIT, NAME=LOW:HIGH:UNIT:log (or :integer) or NAME=LEVEL,LEVEL"
+_FORM = "NAME=LOW:HIGH, NAME=LOW:HIGH:UNIT, NAME=LOW:HIGH:UNIT:log (or :integer), NAME=LEVEL,LEVEL or NAME=LEVEL<LEVEL"
 
 
 class NewStudy(NamedTuple):
@@ -47,11 +47,13 @@ class NewStudy(NamedTuple):
 
 
 def parameter_of(text: str) -> Parameter:
-    """Parse a parameter of the command line: NAME=LOW:HIGH[:UNIT[:linear|log|integer]], or NAME=LEVEL,LEVEL,… for
-    unordered levels. Raises InputError."""
+    """Parse a parameter of the command line: NAME=LOW:HIGH[:UNIT[:linear|log|integer]], NAME=LEVEL,LEVEL,… for
+    unordered levels, or NAME=LEVEL<LEVEL<… for ordered ones. Raises InputError."""
     name, equals, rest = text.partition("=")
-    if equals and name.strip() and name.isprintable() and ":" not in rest and "," in rest:
-        return Parameter.of_levels(name.strip(), tuple(level.strip() for level in rest.split(",")))
+    between = "<" if "<" in rest else ","
+    if equals and name.strip() and name.isprintable() and ":" not in rest and between in rest:
+        levels = tuple(level.strip() for level in rest.split(between))
+        return Parameter.of_levels(name.strip(), levels, ordered=between == "<")
     low, *others = rest.split(":")
     try:
         ends = float(low), float(others[0])

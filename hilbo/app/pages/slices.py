@@ -120,18 +120,22 @@ def _slice(study, maps: _Slices, k: int, pair: _Pair, marks, levels, felt) -> di
     each answer with its distance from the slice. `pair`: indices of the parameters across and up; without an up, an
     answer's height is its level. `marks` (n, d) and `levels` (n,), on [0, 1]: the answers; `felt` (d,): the present
     rendering, or None. Points are in the unit cube."""
-    best, names = maps.best, study.space.names
+    best, names, parameters = maps.best, study.space.names, study.space.parameters
     others = [i for i in range(len(names)) if i not in pair]
-    held = [_held(study.space.parameters[i], float(best[i])) for i in others]
+    held = [_held(parameters[i], float(best[i])) for i in others]
     across, up = pair
-    trials = [
-        {"x": float(x[across]), "y": float(level if up is None else x[up]), "level": float(level), "now": False,
-         "away": float(np.linalg.norm(differences(study.gp.kernel.levels, x, best)[others]) / 0.35)}
-        for x, level in zip(marks, levels, strict=True)
-    ]  # fmt: skip
+
+    def dot(x: Float[np.ndarray, " d"], height: float) -> dict[str, float]:
+        """Place of a point on the slice; `height`: without an up."""
+        y = height if up is None else _place(parameters[up], float(x[up]))
+        return {"x": _place(parameters[across], float(x[across])), "y": y}
+
+    trials = []
+    for x, level in zip(marks, levels, strict=True):
+        away = float(np.linalg.norm(differences(study.gp.kernel.levels, x, best)[others]) / 0.35)
+        trials.append(dot(x, float(level)) | {"level": float(level), "now": False, "away": away})
     if felt is not None:
-        y = 0.5 if up is None else float(felt[up])
-        trials.append({"x": float(felt[across]), "y": y, "level": 0.0, "now": True, "away": 0.0})
+        trials.append(dot(felt, 0.5) | {"level": 0.0, "now": True, "away": 0.0})
     shown = [
         [round(float(v), 4) if ok else None for v, ok in zip(row, oks, strict=True)]
         for row, oks in zip(maps.mean[k], maps.feasible[k], strict=True)
@@ -141,7 +145,7 @@ def _slice(study, maps: _Slices, k: int, pair: _Pair, marks, levels, felt) -> di
         "across": names[across],
         "up": _ANSWER if up is None else names[up],
         "held": ", ".join(held),
-        "best": [float(best[across]), goal if up is None else float(best[up])],
+        "best": list(dot(best, goal).values()),
         "mean": shown,
         "trials": trials,
     }
@@ -160,7 +164,14 @@ def _axis(parameter: Parameter) -> Float[np.ndarray, " side"]:
     count = len(parameter.levels)
     if not count:
         return np.linspace(0.0, 1.0, _SIDE)
-    return np.floor((np.arange(_SIDE) + 0.5) * count / _SIDE) / (count - 1)
+    return np.asarray(parameter.to_unit(np.floor((np.arange(_SIDE) + 0.5) * count / _SIDE)))
+
+
+def _place(parameter: Parameter, unit: float) -> float:
+    """Place on an axis of the page, on [0, 1], of a value `unit` of the unit cube: equal steps from level to level."""
+    if not parameter.levels:
+        return unit
+    return float(parameter.to_physical(np.asarray(unit))) / (len(parameter.levels) - 1)
 
 
 @program

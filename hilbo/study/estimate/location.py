@@ -119,17 +119,18 @@ def _extrapolates(sd: Float[Array, ""], asked: Float[Array, ""]) -> bool:
 
 
 def _edges(study: Study, x: Float[np.ndarray, " d"]) -> _Edges:
-    """The limits within 1e-6 of the point x (d,) of the unit cube; parameters with levels have none."""
+    """The limits within 1e-6 of the point x (d,) of the unit cube; parameters with unordered levels have none."""
     inner, edges = np.asarray(study.space.to_box(x)), _Edges([], [], _constraints(study, x), [])
     for i, parameter in enumerate(study.space.parameters):
-        if parameter.levels:
+        if parameter.categorical:
             continue
         unit = f" {parameter.unit}" if parameter.unit else ""
         for place, end, word, key in ((0.0, parameter.low, "lowest", "low"), (1.0, parameter.high, "highest", "high")):
+            words = parameter.shown(end) if parameter.levels else f"{end:g}"
             if abs(x[i] - place) < _AT and key in parameter.natural_ends:
-                edges.natural.append(f"the natural end of {parameter.name} ({end:g}{unit})")
+                edges.natural.append(f"the natural end of {parameter.name} ({words}{unit})")
             elif abs(x[i] - place) < _AT:
-                edges.ends.append(f"the {word} {parameter.name} that was searched ({end:g}{unit})")
+                edges.ends.append(f"the {word} {parameter.name} that was searched ({words}{unit})")
             elif abs(inner[i] - place) < _AT:
                 beyond = x.copy()
                 beyond[i] += 2 * _AT * (2 * place - 1)

@@ -25,9 +25,8 @@ MEANING = (
     "session.texts.question_preferred",
 )
 """Keys, with all keys below them, that determine what a response means, but for `FREE`."""
-FREE = {"stimulus": ("within", "silence"), "parameters": ("correlation", "natural_ends")}
-"""Keys below them that do not: how long a presenter is waited for, a hyperparameter of the prior, and whether anything
-exists beyond a range."""
+FREE = {"stimulus": ("within", "silence"), "parameters": ("correlation", "ordered", "at", "natural_ends")}
+"""Keys below them that do not: how long a presenter is waited for, assumptions of the prior, and natural ends."""
 
 
 def meaning_part(tables: Content) -> Content:

@@ -74,8 +74,8 @@ class ParameterTable(_Table, frozen=True):
 
 
 class LevelsTable(_Table, frozen=True):
-    """[parameters.NAME]: a parameter of unordered levels. `correlation`: prior correlation of the latent score between
-    two levels."""
+    """[parameters.NAME]: a parameter of levels. `correlation`: prior correlation of the latent score between two
+    unordered levels. `ordered`: the levels are listed in their order, equally spaced or at the positions `at`."""
 
     levels: Annotated[
         tuple[Annotated[str, msgspec.Meta(min_length=1)], ...],
@@ -83,6 +83,9 @@ class LevelsTable(_Table, frozen=True):
         _text("a list of two or more texts", '["silk", "wood", "stone"]'),
     ]
     correlation: Annotated[float, msgspec.Meta(gt=0, lt=1), _text("a number above 0 and below 1", "0.5")] = 0.5
+    ordered: Annotated[bool, _text("true or false", "true")] = False
+    at: Annotated[tuple[float, ...], _text("a list of rising numbers, one per level", "[0, 1, 4]")] = ()
+    natural_ends: _Ends = ()
 
 
 class ConstraintTable(_Table, frozen=True):

@@ -35,6 +35,7 @@ _LEARNT = ("theta", "variance", "thresholds", "noise")
 _OVERRIDES = ("renderer", "parameters", "session", "report")
 _PHASES = tuple(phase.replace("-", "_") for phase in PHASES)
 _NUMBERS_KEYS = ("low", "high", "unit", "scale", "integer")
+_LEVELS_KEYS = ("correlation", "ordered", "at")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
 
 
@@ -98,24 +99,36 @@ def _kind_of(table: Any) -> type[ParameterTable | LevelsTable]:
 
 
 def _of_one_kind(table: Any, path: str) -> Any:
-    """Return a parameter's parsed table unchanged. Raises `InputError` if it combines levels with keys of numbers, or
-    has a correlation without levels."""
+    """Return a parameter's parsed table unchanged. Raises `InputError` if it combines levels with keys of numbers, has
+    keys of levels without levels, or those of one order with those of the other."""
     if _kind_of(table) is LevelsTable:
-        beside = next((key for key in table if key in _NUMBERS_KEYS), None)
+        beside, ordered = next((key for key in table if key in _NUMBERS_KEYS), None), table.get("ordered") is True
         if beside is not None:
-            raise InputError(f"{path}.{beside} stands beside levels, which have no order and no unit; leave it out.")
-    elif isinstance(table, Mapping) and "correlation" in table:
-        raise InputError(f"{path}.correlation is of levels, and there are none; leave it out, or give levels.")
+            lack = "no numbers and no unit" if ordered else "no order and no unit"
+            raise InputError(f"{path}.{beside} stands beside levels, which have {lack}; leave it out.")
+        if "correlation" in table and ordered:
+            raise InputError(f"{path}.correlation is of unordered levels; leave it out, ordered ones have a length.")
+        stray = next((key for key in ("at", "natural_ends") if table.get(key)), None)
+        if stray is not None and not ordered:
+            raise InputError(f"{path}.{stray} is of ordered levels; add ordered = true, or leave it out.")
+        return table
+    stray = next((key for key in _LEVELS_KEYS if isinstance(table, Mapping) and key in table), None)
+    if stray is not None:
+        raise InputError(f"{path}.{stray} is of levels, and there are none; leave it out, or give levels.")
     return table
 
 
 def _with_theta(table: GPTable, parameters: Collection[ParameterTable | LevelsTable]) -> GPTable:
     """The same [gp] with `length` replaced by theta = 1/(2 length^2), so that both notations have one hash. Raises
-    `InputError` for both at once, and for lists whose length is not the number of parameters without levels."""
-    dim = sum(isinstance(p, ParameterTable) for p in parameters)
+    `InputError` for both at once, and for lists whose length is not the number of parameters that have a length."""
+    ordered = sum(isinstance(p, LevelsTable) and p.ordered for p in parameters)
+    dim = ordered + sum(isinstance(p, ParameterTable) for p in parameters)
     for name, values in (("theta", table.theta), ("length", table.length)):
         if isinstance(values, tuple) and len(values) != dim:
-            count, which = len(values), "" if dim == len(parameters) else " without levels"
+            count, which = (
+                len(values),
+                "" if dim == len(parameters) else f" without {'unordered ' if ordered else ''}levels",
+            )
             raise InputError(
                 f"gp.{name} has {count} numbers; it must be one number or {dim}, one per parameter{which}."
             )
@@ -150,7 +163,8 @@ def box_of(tables: Tables) -> Box:
 def _parameter(name: str, table: ParameterTable | LevelsTable) -> Parameter:
     """The parameter of one table of [parameters]."""
     if isinstance(table, LevelsTable):
-        return Parameter.of_levels(name, table.levels, table.correlation)
+        fields = msgspec.structs.asdict(table)
+        return Parameter.of_levels(name, **fields)
     return Parameter(name, **msgspec.structs.asdict(table))
 
 
