@@ -69,9 +69,18 @@ class Parameter:
                 raise InputError(f"{path}.{key} is {end}; it must be a whole number where integer = true.")
 
     @classmethod
-    def of_levels(cls, name: str, levels: tuple[str, ...], correlation: float = 0.5, **others: Any) -> "Parameter":
-        """Parameter with levels, by default unordered; `others`: its other fields. Raises `InputError` if invalid."""
-        return cls(name, 0.0, len(levels) - 1.0, levels=levels, correlation=correlation, **others)
+    def of_levels(
+        cls,
+        name: str,
+        levels: tuple[str, ...],
+        correlation: float = 0.5,
+        ordered: bool = False,
+        at: tuple[float, ...] = (),
+        natural_ends: tuple[End, ...] = (),
+    ) -> "Parameter":
+        """Parameter with levels, by default unordered. Raises `InputError` for invalid fields."""
+        last = len(levels) - 1.0
+        return cls(name, 0.0, last, "", "linear", False, levels, correlation, natural_ends, ordered, at)
 
     @property
     def categorical(self) -> bool:

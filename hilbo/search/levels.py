@@ -9,12 +9,14 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from jaxtyping import Float, Real
+from jaxtyping import Real
 
 from hilbo.errors import InputError
 from hilbo.numerics.host import namespace_of
 
 __all__ = ["check_levels", "index_at", "position_of"]
+
+_Array = Real[Any, "..."]
 
 
 def check_levels(path: str, levels: Sequence[str], correlation: float, ordered: bool, at: Sequence[float]) -> None:
@@ -44,14 +46,14 @@ def check_levels(path: str, levels: Sequence[str], correlation: float, ordered: 
         raise InputError(f"{path}.at is {list(at)}; it must rise from each number to the next.")
 
 
-def position_of(at: Sequence[float], index: Real[Any, "..."]) -> Float[Any, "..."]:
+def position_of(at: Sequence[float], index: _Array) -> _Array:
     """Levels (array of indices) at the positions `at` on [0, 1], exact at both ends; an index is rounded first."""
     xp = namespace_of(index)
     positions = xp.asarray(_on_unit(at), xp.result_type(1.0, index))
     return positions[xp.clip(xp.round(index), 0, len(at) - 1).astype(int)]
 
 
-def index_at(at: Sequence[float], unit: Real[Any, "..."]) -> Float[Any, "..."]:
+def index_at(at: Sequence[float], unit: _Array) -> _Array:
     """Index (array) of the level nearest to values of [0, 1], for levels at the positions `at`."""
     xp = namespace_of(unit)
     unit = xp.asarray(unit, xp.result_type(1.0, unit))

@@ -145,7 +145,7 @@ def _slice(study, maps: _Slices, k: int, pair: _Pair, marks, levels, felt) -> di
         "across": names[across],
         "up": _ANSWER if up is None else names[up],
         "held": ", ".join(held),
-        "best": list(dot(best, goal).values()),
+        "best": list(dot(np.asarray(best), goal).values()),
         "mean": shown,
         "trials": trials,
     }
