@@ -313,7 +313,7 @@ ATTEMPTS = (
     Attempt(_PORT, "set cookies until the browser's requests are too large",
             "the open page's commands are accepted; it cannot be loaded again", _flooded),
     Attempt(_USER, "read logs and keys", "denied", _as_nobody(_reads)),
-    Attempt(_USER, "create a file beside the log", "denied", _as_nobody(_writes)),
+    Attempt(_USER, "create a file next to the log", "denied", _as_nobody(_writes)),
     Attempt(_USER, "read keys or links in the list of processes", "denied", _as_nobody(_listed)),
     Attempt(_USER, "listen on the port of the session", "denied", _as_nobody(_listens)),
     Attempt(_USER, "end the session's process", "denied", _as_nobody(_ends)),

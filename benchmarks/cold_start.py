@@ -1,4 +1,4 @@
-"""What passes between the start of a process and the first chosen point of a session, part by part.
+"""Time from the start of a process to the first chosen point of a session, part by part.
 
     python benchmarks/cold_start.py --write      into docs/results/run_time.md
 
@@ -32,7 +32,7 @@ PROCESSES = {
     "study loaded": X64 + STUDY,
     "session started: the first point to show": X64 + STUDY + START,
     "first chosen point, after 5 answers": WHOLE,
-    "the same with programs kept, as commands keep them": KEPT,
+    "the same with cached programs, as in commands": KEPT,
     "the same by XLA's newer code generator (`hilbo/numerics/compiling.py`)": "import hilbo.numerics.compiling\n"
     "hilbo.numerics.compiling._TRIED = (0, 0)\n" + WHOLE,
 }

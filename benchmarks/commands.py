@@ -1,11 +1,11 @@
-"""What a person waits for: every command of the README on what is shipped, whole processes, beside `import jax`.
+"""Waiting times: every command of the README on the shipped data, whole processes, compared with `import jax`.
 
     python benchmarks/commands.py FILE [--before CHECKOUT] [--rounds 5] [--only NAME,NAME]
     python benchmarks/commands.py FILE --write
 
 FILE (JSON Lines) collects a row for each command; a run that was stopped goes on at the first command without a row.
-Each round runs the command once with kept programs and, with `--before`, once by another checkout of hilbo (in the same
-environment); `import jax` stands between them. `empty` is one run with empty caches, `traced` one without kept
+Each round runs the command once with cached programs and, with `--before`, once by another checkout of hilbo (in the
+same environment); `import jax` stands between them. `empty` is one run with empty caches, `traced` one without kept
 programs. Memory is the process's largest. --write puts the table into docs/results/run_time.md.
 """
 
@@ -61,11 +61,11 @@ def main():
 def measured(name, rounds, before, folder):
     """Seconds, seconds to the optimum and MB of every run of a command, by way; seconds of the imports between."""
     a_study(before or ROOT, folder)
-    ways = {"kept": (ROOT, folder / f"cache {name}", True)}
+    ways = {"cached": (ROOT, folder / f"cache {name}", True)}
     ways |= {} if before is None else {"before": (before, folder / f"cache {name} before", False)}
     runs = {f"{way}, empty": [command(name, *how, folder)] for way, how in ways.items()}
     for way, how in ways.items():  # not counted: the caches
-        for _ in range(1 + (way == "kept")):
+        for _ in range(1 + (way == "cached")):
             command(name, *how, folder)
     imports = []
     for _ in range(rounds):
@@ -118,7 +118,7 @@ def process(words, root, cache, keep):
 def document(rows):
     lines = [
         "Made by `python benchmarks/commands.py FILE --write`: whole processes, medians of five (*empty*, *traced*:",
-        "one run), beside `import jax` in the same minutes. Programs are kept from one command to the next",
+        "one run), compared with `import jax` in the same minutes. Programs are cached between commands",
         "(docs/design.md). *traced* is with HILBO_KEEP_PROGRAMS=0, *empty* the first run of all, *before* the last",
         "commit at which every command traced and compiled for itself.",
         "",

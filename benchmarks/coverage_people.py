@@ -89,9 +89,10 @@ def main():
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
     lines = [
-        f"Made by `python benchmarks/coverage_people.py --write`: {chosen.people} simulated people a row.",
+        f"Made by `python benchmarks/coverage_people.py --write`: {chosen.people} simulated participants a row.",
         "",
-        "| trials | chosen by | lapse rate | drift | lapse held, too high, median width | drift held, median width |",
+        "| trials | selection | lapse rate | drift | lapse: coverage, too high, median width"
+        " | drift: coverage, median width |",
         "|---:|---|---:|---:|---:|---:|",
     ]
     for case in CASES:

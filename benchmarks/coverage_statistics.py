@@ -143,8 +143,8 @@ def page(results, studies):
     heads = [f"{count}, {case}" for count, case in results]
     lines = [
         f"Made by `python benchmarks/coverage_statistics.py --write`: {studies} studies a column. A cell is",
-        "the share of 95 % intervals that held the truth, in %; in brackets, how many were one-sided (separation);",
-        f"the median width. The share's own standard error is {100 * np.sqrt(0.05 * 0.95 / studies):.1f} %.",
+        "the coverage of 95 % intervals, in %; in brackets, the number of one-sided ones (separation);",
+        f"the median width. The standard error of the coverage is {100 * np.sqrt(0.05 * 0.95 / studies):.1f} %.",
         "",
         "| table | coefficient | errors | " + " | ".join(heads) + " |",
         "|---|---|---|" + "---|" * len(heads),

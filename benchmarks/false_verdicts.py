@@ -45,7 +45,7 @@ def main():
 
 
 def table(studies):
-    yield "| differences | people | supports | contradicts |"
+    yield "| differences | participants | supports | contradicts |"
     yield "|---|---:|---:|---:|"
     for kind, (name, draw) in enumerate(KINDS.items()):
         for people in PEOPLE:

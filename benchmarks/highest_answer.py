@@ -119,7 +119,7 @@ def table(rows):
     yield "|---|---|---:|---:|---:|---:|---:|---:|"
     groups = {
         "`paper-02`, `paper-05`, … `paper-29`": lambda name: name in PAPER,
-        "people with a place that they like best": lambda name: name in OTHERS and "functions" not in name,
+        "participants with individual optima": lambda name: name in OTHERS and "functions" not in name,
         "functions drawn": lambda name: "functions" in name,
     }
     for words, is_of in groups.items():

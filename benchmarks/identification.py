@@ -231,14 +231,14 @@ def timing(rounds=5):
         "| task | scipy (ms) | hilbo (ms) | ratio |\n|---|---:|---:|---:|\n"
         "| identification of both tests, 9,002 samples, N = 101, five starts: `least_squares` on `lfilter` with finite"
         f" differences, against a screened grid and exact Jacobians | {1e3 * slow:.0f} | {1e3 * fast:.0f} |"
-        f" {slow / fast:.1f} x |\n\nSums of NRMSE² that they end in: {costs[0]:.9e} and {costs[1]:.9e}.\n"
+        f" {slow / fast:.1f} x |\n\nFinal sums of NRMSE²: {costs[0]:.9e} and {costs[1]:.9e}.\n"
     )
 
 
 def coverage_table(folder):
     """Shares of intervals that hold the truth."""
     lines = [
-        "| noise | coordinate | profile: two-sided | hold | one-sided | hold | search failed | bootstrap |",
+        "| noise | coordinate | profile: two-sided | coverage | one-sided | coverage | search failed | bootstrap |",
         "|---|---|---:|---:|---:|---:|---:|---:|",
     ]
     for noise, rho in MEMORY.items():

@@ -77,7 +77,7 @@ def measure(minutes):
         ("requests answered, sets changed in contact", f"{len(trips):,}, {conversation['changes']}"),
         ("frames damaged, either way", f"{lost}"),
         ("requests sent again, answers that fit none", f"{link.retries}, {link.stray}"),
-        ("HOLDs, overruns told by the device", f"{status.holds}, {status.overruns}"),
+        ("HOLDs, overruns reported by the device", f"{status.holds}, {status.overruns}"),
         ("round trip: median, 99 %, largest", " / ".join(f"{np.quantile(trips, q):.2f} ms" for q in (0.5, 0.99, 1))),
     ], words
 
@@ -90,7 +90,7 @@ def main():
     rows, words = measure(chosen.minutes)
     table = "| | |\n|---|---:|\n" + "".join(f"| {name} | {value} |\n" for name, value in rows)
     if words:
-        table += f"\nThe simulated device's last words: {words.removeprefix('hilbo-device: ')}"
+        table += f"\nThe simulated device's last line: {words.removeprefix('hilbo-device: ')}"
     table += f" Python {platform.python_version()}, {platform.system()}.\n"
     print(table)
     if chosen.write:

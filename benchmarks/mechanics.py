@@ -187,13 +187,13 @@ def text(rows, kept, rounds):
         "Time against error of the plain recursion, one sample after the other as on a device: force of a 5 mm",
         f"relaxation over 3 s, K0, K1, B1, α = {', '.join(map(str, FOAM))}, against all 3,000 past samples.",
         "",
-        "| memory | numbers kept in the sum | µs per sample | largest error / largest force |",
+        "| memory | stored numbers | µs per sample | largest error / largest force |",
         "|---|---:|---:|---:|",
     ]
     lines += [f"| {name} | {size} | {micro:.2f} | {error:.1e} |" for name, size, micro, error in kept]
     lines += [
         "",
-        "Log-memory reads delays that grow by a factor, from a ring that must hold all of them.",
+        "Log-memory reads delays that grow by a factor, from a ring that must store all of them.",
         "",
         "![time against error](memory.svg)",
     ]

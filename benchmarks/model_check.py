@@ -3,8 +3,8 @@
     python benchmarks/model_check.py FILE [--studies 4] [--only NAME]
     python benchmarks/model_check.py FILE --write
 
-Everybody is left out and predicted in two ways: from the others' answers alone, and from their own earlier answers too.
-FILE (JSON Lines) collects a row for each study; a run that was stopped goes on. --write puts the table into
+Each participant is left out and predicted in two ways: from the others' responses alone, and also from the earlier
+ones. FILE (JSON Lines) collects a row for each study; a run that was stopped goes on. --write puts the table into
 docs/methods/which_method.md.
 """
 
@@ -86,14 +86,14 @@ def one_study(name, seed):
 def table(rows):
     heads = ("predicted", "the highest answer", "a share differs", "a quadratic is better", "by two errors")
     lines = ["| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(heads) - 1)]
-    ways = {"alone": "from the others alone", "in turn": "from their own earlier answers too"}
+    ways = {"alone": "from the others alone", "in turn": "also from the participant's earlier responses"}
     for way, words in ways.items():
         each = [row[way] for row in rows]
         counts = (sum(e[k] for e in each) for k in ("a share differs", "the quadratic is better", "beyond two errors"))
         cells = " | ".join(f"{count} of {len(rows)}" for count in counts)
         lines.append(f"| {words} | {100 * np.mean([e['highest'] for e in each]):.1f} % | {cells} |")
     given, new = (100 * np.mean([row[key] for row in rows]) for key in ("given", "new person"))
-    lines.append(f"\nGiven were {given:.1f} %; new people at the same renderings would give {new:.1f} %.")
+    lines.append(f"\nObserved: {given:.1f} %; expected of new participants at the same stimuli: {new:.1f} %.")
     return "\n".join(lines)
 
 

@@ -102,7 +102,7 @@ def drawn(people, seed, share):
 
 
 def table(rows):
-    lines = ["| drawn from | people | studies | a misfit is named |", "|---|---:|---:|---:|"]
+    lines = ["| drawn from | participants | studies | misfit reported |", "|---|---:|---:|---:|"]
     for rule, people in sorted({(row["rule"], row["people"]) for row in rows}):
         said = [
             bool(check_sentences(content_of(row))) for row in rows if (row["rule"], row["people"]) == (rule, people)

@@ -86,7 +86,14 @@ def one_group(preset, seed):
 
 def table(rows):
     """How many people have sets of second choice, and how many like best, mid and worst in that order."""
-    heads = ["preset", "sets", "people", "best most, worst least", "best over worst", "chance at best, mid, worst"]
+    heads = [
+        "preset",
+        "sets",
+        "participants",
+        "best highest, worst lowest",
+        "best over worst",
+        "probability at best, mid, worst",
+    ]
     lines = []
     for preset in sorted({row["preset"] for row in rows}):
         every = [person for row in rows if row["preset"] == preset for person in row["people"]]

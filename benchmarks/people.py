@@ -10,7 +10,7 @@ middle; the held-out answers are predicted where they were given. No answer is l
 but the randomised probability integral transform (seed 0).
 
 Of the clips, learnt-2 also learns a random effect: people who are left out are then predicted in the clips that others
-saw, and beside the table stands how well answers to a clip are predicted that nobody saw.
+saw; a line after the table gives the prediction of responses to an unseen clip.
 
 Hyperparameters maximise the evidence of the hierarchical model on the training people of each fold, noise 1 (the scale
 of f is free), and serve every rule but learnt-1, which learns its own there. Beside the rules stand the training
@@ -197,7 +197,7 @@ def of_new_contexts(data):
     gain, error = clustered(cost[0] - cost[1], data.context)
     (less, less_error), (more, more_error) = inside
     return (
-        f"\nAnswers to a clip that nobody saw cost {cost[0].mean():.3f} nats without and {cost[1].mean():.3f} with the"
+        f"\nResponses to an unseen clip cost {cost[0].mean():.3f} nats without and {cost[1].mean():.3f} with the"
         f" random effect (gain {gain:+.3f} ± {error:.3f}, errors by clip); {100 * less:.1f} ± {100 * less_error:.1f} %"
         f" and {100 * more:.1f} ± {100 * more_error:.1f} % of them lie within the central 95 %.\n"
     )
@@ -207,8 +207,8 @@ def describe(learnt):
     gp = learnt.gp
     theta, edges = (", ".join(f"{v:.2f}" for v in part) for part in (gp.kernel.theta, gp.likelihood.thresholds))
     return (
-        f"Learnt from everybody: theta {theta}, variance {float(gp.kernel.variance):.2f}, thresholds {edges} (noise 1),"
-        f" share {float(learnt.share):.3f}; log evidence {float(learnt.log_evidence):.1f}."
+        f"Fitted to all participants: theta {theta}, variance {float(gp.kernel.variance):.2f}, thresholds {edges}"
+        f" (noise 1), share {float(learnt.share):.3f}; log evidence {float(learnt.log_evidence):.1f}."
     )
 
 
@@ -217,13 +217,13 @@ def table(chosen, data, chances, everybody, shares, wide):
     cost = {rule: -np.log(p[n, data.q]) for rule, p in chances.items()}
     order = sorted(cost, key=lambda rule: cost[rule].mean())
     lines = [
-        f"Made by `python benchmarks/people.py {chosen.data} FILE --write`: {len(data.names)} people,"
-        f" {len(data.q):,} answers, {len(data.points)} points.",
+        f"Made by `python benchmarks/people.py {chosen.data} FILE --write`: {len(data.names)} participants,"
+        f" {len(data.q):,} responses, {len(data.points)} points.",
         describe(everybody),
-        f"Over the folds the share was between {min(shares):.3f} and {max(shares):.3f}; learnt-1 took widths of"
-        f" people's own in {sum(wide)} of {len(wide)}.",
+        f"Over the folds the share was between {min(shares):.3f} and {max(shares):.3f}; learnt-1 used individual"
+        f" widths in {sum(wide)} of {len(wide)}.",
         "",
-        "| rule | mean negative log density | less than the probit's by | within the central 95 % |",
+        "| method | mean negative log density | gain over the probit | within the central 95 % |",
         "|---|---:|---:|---:|",
     ]
     for rule in order:

@@ -248,7 +248,7 @@ def regrets(parts):
 def differences(parts):
     """Paired: what the recommended recipe loses less, with its 95 % interval, and distances."""
     others = ("learnt-1", "bcm", "average")
-    heads = ["studies of", *(f"{other} less {RECOMMENDED}, 95 %" for other in others), "NRMSE to the best, median"]
+    heads = ["studies of", *(f"{other} minus {RECOMMENDED}, 95 %" for other in others), "NRMSE to the best, median"]
     lines = []
     for name, part in parts.items():
         cells = [name]
@@ -260,12 +260,12 @@ def differences(parts):
 
 
 def itself(parts):
-    """Whether the 95 % region held the best rendering, its volume, and what was promised less what is so."""
+    """Coverage of the 95 % region, its volume, and the predicted minus the true probability."""
     heads = [
         "studies of",
-        "the region held the best",
+        "coverage of the region",
         "its volume, mean",
-        "promised less true P(highest)",
+        "predicted minus true P(highest)",
         "not converged",
     ]
     lines = []
@@ -289,7 +289,7 @@ def sessions(rows, design):
         for row in rows
         if row["design"] == design + MEDIANS and (row["population"], row["seed"]) in other
     ]
-    heads = ["sessions choose by", "studies", "the medians", "the paper's", "the medians' less the paper's, 95 %"]
+    heads = ["trials selected with", "studies", "the medians", "the paper's", "medians minus the paper's, 95 %"]
     lines = []
     for name, belongs in GROUPS.items():
         part = [pair for pair in pairs if belongs(pair[0]["population"])]

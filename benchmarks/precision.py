@@ -227,8 +227,8 @@ PARTS = (likelihood, inference, gradients, hyperparameters, committee, choices, 
 
 PAGE = """Made by `python benchmarks/precision.py --write`. Both precisions get the same inputs, rounded to float32.
 
-"Needed" is what the result is for. The answers carry a noise of 0.5, or 0.1 at least: an error of a hundredth of that
-changes no decision. A force is held to a thousandth of the largest. NaN: a certificate does not hold in float32.
+"Needed" is the accuracy for the use of the result. The responses have a noise of 0.5, or 0.1 at least: an error of a
+hundredth of that changes no decision. A force needs a thousandth of the largest. NaN: the diagnostics fail in float32.
 
 | result | error of float32 | needed | enough |
 |---|---:|---:|---|
@@ -237,7 +237,7 @@ changes no decision. A force is held to a thousandth of the largest. NaN: a cert
 {verdict}
 
 Identification is done in float64 (`hilbo identify` switches it on): its profile intervals take second differences of
-sums of squares, of which float32 leaves nothing. What float32 cannot do at all, a
+sums of squares, which float32 cannot resolve. The case beyond float32, a
 prior sd of more than about 100 noises, is in [stress](#stress).
 """
 

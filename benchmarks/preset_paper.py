@@ -85,7 +85,7 @@ def report(studies):
         "",
         "| | simulated | paper |",
         "|---|---|---|",
-        f'| answers "close" of 25, mean ± sd over people | {close[0]:.2f} ± {close[1]:.2f} | 5.96 ± 4.47 |',
+        f'| responses "close" of 25, mean ± sd over participants | {close[0]:.2f} ± {close[1]:.2f} | 5.96 ± 4.47 |',
         f"| individuals' NRMSE to the truth, quartiles | {q[0]:.0f}, {q[1]:.0f}, {q[2]:.0f} % | 13, 24, 41 % |",
         f"| individual optima K1 (N/mm) | {mean[0]:.2f} ± {sd[0]:.2f} | 8.44 ± 8.25 |",
         f"| B1 (N.s^alpha/mm) | {mean[1]:.2f} ± {sd[1]:.2f} | 10.28 ± 8.64 |",

@@ -164,7 +164,7 @@ def page(rows):
         "Predicted, and not used to choose the populations (medians over studies; shares of preferences):",
         "",
         "| population | rule | optimum to the truth, quartiles | best to mid, best to worst, mid to worst"
-        ' | preferred to individuals\' sets | "close" likeliest for K1, B1, alpha in |',
+        ' | preferred to individual sets | "close" most probable for K1, B1, alpha in |',
         "|---|---|---|---|---:|---|",
         "| *the paper* | bcm | 4 % | 95, 100, 90 % | 73 % | 4.6 to 6.1, 4.3 to 15.1, 0.13 to 0.33 |",
     ]

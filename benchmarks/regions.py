@@ -49,7 +49,7 @@ def main():
 
 
 def one_study(design, seed):
-    """Whether the region held the best rendering, its volume, the regret, and the share of each answer."""
+    """Coverage of the region, its volume, the regret, and the proportion of each response."""
     people, trials = map(int, design.split("x"))
     study = with_trials(PAPER, trials)
     scene = drawn_scene(study, people, seed)
@@ -92,8 +92,8 @@ def drawn_scene(study, people, seed):
 
 
 def table(rows):
-    """By design: the share of studies whose region held the best rendering with its 95 % interval, and its volume."""
-    heads = "| studies | | held the best rendering, 95 % interval | volume, mean | regret, mean |"
+    """By design: the coverage of the region with its 95 % interval, and its volume."""
+    heads = "| studies | | coverage, 95 % interval | volume, mean | regret, mean |"
     lines = [heads, "|---|---:|---:|---:|---:|"]
     for design in sorted({row["design"] for row in rows}):
         some = [row for row in rows if row["design"] == design]

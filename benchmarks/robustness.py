@@ -43,9 +43,9 @@ CRITERIA = {
     FIXED: ("bcm", ""),
     "individual": ("bcm", "individual evidences, summed"),
     "left out": ("bcm", "evidence of participants left out"),
-    "one model, bcm": ("bcm", "evidence of one model of all answers"),
+    "one model, bcm": ("bcm", "evidence of one model of all responses"),
     FIXED + ", pooled": ("pooled", ""),
-    "one model, pooled": ("pooled", "evidence of one model of all answers"),
+    "one model, pooled": ("pooled", "evidence of one model of all responses"),
     FIXED + ", learnt-2": ("learnt-2", ""),
     "learnt-2": ("learnt-2", "its own evidence"),
 }
@@ -114,7 +114,7 @@ def one_study(name, seed, pooled):
 def table(rows):
     lines = [
         "| rule | hyperparameters maximise | studies | optimum moves, median (quartiles) | below 3 % | regret |"
-        """ less the fixed one's | "close" the likeliest answer there |""",
+        """ minus the fixed one's | "close" most probable there |""",
         "|---|---|---:|---:|---:|---:|---:|---:|",
     ]
     for key, (rule, criterion) in CRITERIA.items():

@@ -155,7 +155,7 @@ def table(rows, true_share, chosen):
     lines = [
         f"Made by `python benchmarks/rules.py FOLDER --seeds {done}"
         f" --share-answers {chosen.share_answers} --write`: {done} {'studies' if several else 'study'} of {PEOPLE} x 25"
-        " at each level of differences between people (0: all the same, 1: the preset `paper-individuals`).",
+        " at each level of differences between participants (0: all the same, 1: the preset `paper-individuals`).",
         "",
         f"| NRMSE to the truth in %{', median [quartiles]' if several else ''} | "
         + " | ".join(f"{level:g}" for level in LEVELS)
@@ -177,7 +177,7 @@ def table(rows, true_share, chosen):
     lines.append("|---|" + "---:|" * len(LEVELS))
     lines.append("| true | " + " | ".join(f"{true_share[level]:.2f}" for level in LEVELS) + " |")
     mean = [f"{np.mean([row['share'] for row in rows[level]]):.2f}" for level in LEVELS]
-    lines.append(f"| learnt{', mean over studies' if several else ''} | " + " | ".join(mean) + " |")
+    lines.append(f"| fitted{', mean over studies' if several else ''} | " + " | ".join(mean) + " |")
     if not several:
         return "\n".join(lines) + "\n"
     held = [100 * np.mean([row["low"] <= true_share[v] <= row["high"] for row in rows[v]]) for v in LEVELS]

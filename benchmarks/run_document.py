@@ -5,10 +5,10 @@ import platform
 ASKED = {"live step": 6, "session": 6, "cohort": 5, "pooled": 1.5, "hyperparameters": 10}
 ASKED |= {f"{name}, alone": ASKED[name] for name in ("live step", "session")}
 NAMES = {
-    "live step": "live step: 24 answers to the next point, `Session`'s own step; NumPy: best of 20,000 points",
-    "live step, alone": "the same, each in a loop of its own",
+    "live step": "live step: 24 answers to the next point, the step of `Session`; NumPy: best of 20,000 points",
+    "live step, alone": "the same, each in a separate loop",
     "session": "25-trial session, `Session.start` to the last `tell`; NumPy: 5 given points, 20 such steps",
-    "session, alone": "the same, each in a loop of its own",
+    "session, alone": "the same, each in a separate loop",
     "cohort": "24 people x 25 trials fitted, aggregated (BCM) at 20,000 points; screening in float32",
     "cohort, float64": "the same in float64",
     "pooled": "one GP on 600 answers, and the best of 20,000 points",
@@ -18,7 +18,7 @@ NAMES = {
 
 LIMITS = (
     "",
-    "What stands between a row and its floor:",
+    "Differences between a row and its floor:",
     "",
     "- live step: between NumPy's steps, as between people's answers, its code and numbers leave the caches. The fit,",
     "  a quarter of a step in a loop, takes four times as long then, and a call of a function that does nothing ten",
@@ -36,7 +36,7 @@ LIMITS = (
 def table(run):
     """The times of one run."""
     lines = [
-        "| task | NumPy (ms) | hilbo, Laplace (ms) | ratio (asked) | hilbo, EP (ms) | EP / Laplace |",
+        "| task | NumPy (ms) | hilbo, Laplace (ms) | ratio (target) | hilbo, EP (ms) | EP / Laplace |",
         "|---|---:|---:|---:|---:|---:|",
     ]
     for key, times in run["tasks"].items():
@@ -60,8 +60,8 @@ def document(runs, rounds):
         "Made by `python benchmarks/run.py --write` (`make bench` prints the first table). hilbo and the textbook",
         "NumPy form, benchmarks/reference_numpy.py, take turns in one run; medians of",
         f"{rounds} rounds ({40 * rounds} of the live step); {platform.machine()}, Python {platform.python_version()},",
-        f"jax {jax.__version__}. What the chosen points are worth:",
-        "[what sessions choose](accuracy.md#what-sessions-choose).",
+        f"jax {jax.__version__}. Quality of the chosen points:",
+        "[trial selection](accuracy.md#trial-selection-in-sessions).",
         "",
         "### One core, one BLAS thread",
         "",
@@ -86,11 +86,11 @@ def document(runs, rounds):
 
 
 def floor_text(run):
-    """What the operations that cannot be skipped take, beside what the tasks take."""
+    """The time of the necessary operations, next to that of the tasks."""
     cost, tasks = run["floors"], run["tasks"]
     lines = [
         "",
-        "| task | inference | what it cannot do without | floor (ms) | hilbo (ms) | hilbo / floor |",
+        "| task | inference | necessary operations | floor (ms) | hilbo (ms) | hilbo / floor |",
         "|---|---|---|---:|---:|---:|",
     ]
     for key, which, what, floor in bounds(cost):
@@ -101,7 +101,7 @@ def floor_text(run):
 
 
 def bounds(cost):
-    """(task, which inference, what it cannot do without, seconds of that), from the seconds of `run_floors.floors`."""
+    """(task, inference, necessary operations, their seconds), from the seconds of `run_floors.floors`."""
     step = cost["terms 25"] + cost["factor 25"] + 2 * cost["solve 25"]
     fit = cost["steps 25"] * step + cost["factor 25"] + cost["solves 25"]
     live = cost["dispatch"] + fit + 27 * 625 * 25 * cost["product 26 x 25 x 5,000, float32"]

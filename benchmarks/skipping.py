@@ -1,4 +1,4 @@
-"""What hilbo does not compute, what that saves and what it costs in accuracy; --write: into docs/results/run_time.md.
+"""Computations that hilbo skips, with the saving and the loss of accuracy; --write: into docs/results/run_time.md.
 
     python benchmarks/skipping.py --write
 
@@ -16,7 +16,7 @@ HEAD = """\
 Made by `python benchmarks/skipping.py --write`, on one core: the fastest of {rounds} rounds, with and without the skip
 in turn. Errors are the largest over all points, in units of the prior's sd. "Bound" is what the code guarantees.
 
-| skip | without (us) | with (us) | saves | error | bound | held by |
+| skip | without (us) | with (us) | saves | error | bound | tested by |
 |---|---:|---:|---:|---:|---|---|
 """
 
@@ -63,7 +63,7 @@ def tasks():
     box = jnp.asarray(np.random.default_rng(0).random((int(20_000 / study.space.volume()), 3)))
     rows = [
         (
-            "variance not asked: 20,000 means",
+            "variance not required: 20,000 means",
             lambda: whole(posterior, points),
             lambda: mean(posterior, points),
             gap(whole(posterior, points)[0], mean(posterior, points)),
@@ -121,15 +121,15 @@ def tasks():
     ]
     notes = [
         "",
-        "What does not pay, and is not done:",
+        "Without benefit, and not implemented:",
         "",
         f"- Warm starts: {int(warm_mode.steps)} steps in place of {int(cold_mode.steps)}; the bits of the next point"
-        " would depend on the way to this state, and a log could not be replayed from its answers alone.",
-        "- Appended updates: all curvatures change with an answer, so that the Newton matrix is factorised anew,"
-        " whatever is known of the last one, and the search needs no root of the covariance that could be updated.",
-        "- Participants who cannot move a query: no answer within reach (covariance below 1e-3 with each of a person's"
-        f" 25) holds for {100 * shares[0]:.1f} % of the (person, point) pairs, below 1e-6 for {100 * shares[1]:.1f} %;"
-        " their exponentials are what one would have to compute to know.",
+        " would depend on the path to this state, and a log could not be replayed from its responses alone.",
+        "- Appended updates: all curvatures change with a response, so that the Newton matrix must be factorised again,"
+        " and the search needs no root of the covariance that could be updated.",
+        "- Participants who cannot move a query: the covariance with each of the 25 responses is below 1e-3 for"
+        f" {100 * shares[0]:.1f} % of the (participant, point) pairs, below 1e-6 for {100 * shares[1]:.1f} %; finding"
+        " these pairs requires the same exponentials.",
     ]
     return rows, notes
 

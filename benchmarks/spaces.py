@@ -1,4 +1,4 @@
-"""Sessions on published test functions cut into three categories: hilbo's choices beside chance and Sobol' points.
+"""Sessions on published test functions cut into three categories: hilbo's choices, random and Sobol' points.
 
     python benchmarks/spaces.py FILE [--sessions 8]
     python benchmarks/spaces.py FILE --write
@@ -187,8 +187,9 @@ def page(rows):
         "",
         f"Made by `python benchmarks/spaces.py FILE --sessions {count}`, then `--write`. Published test functions are",
         "cut into three categories at two of their quantiles over the feasible set. After so many answers the",
-        "rendering with the largest posterior mean is read. The table holds the share of the feasible set that is",
-        "better than it: the median over sessions (upper quartile). All ways have the same model and first trials.",
+        "stimulus with the largest posterior mean is evaluated. The table has the proportion of the feasible set",
+        "that is better than it: the median over sessions (upper quartile).",
+        "All ways have the same model and first trials.",
         "",
         "| function | cut at | trials | " + " | ".join(WAYS) + " |",
         "|---|---|---:|" + "---:|" * len(WAYS),
@@ -207,19 +208,19 @@ def page(rows):
         f"In {first} of {len(ranks)} rows hilbo's median is the lowest of three, in {last} the highest; there are"
         " few sessions.",
         "",
-        "Within the highest category all answers are alike: once it is found a session stays there, and no answer",
-        "tells a good rendering from a better one. Even points go on to show the slopes around it. Where nearly all",
-        "answers are the lowest, the largest posterior mean is where nothing was asked: nothing is found yet.",
+        "Within the highest category all responses are equal: once it is found a session stays there, and no response",
+        "distinguishes a good stimulus from a better one. Uniform points also sample the slopes around it. If nearly",
+        "all responses are the lowest, the largest posterior mean is at an untested point: no maximum is found yet.",
     ]
     outside = sum(row["outside"] for row in judged)
     lines += [
         "",
-        f"Of all renderings that were asked, {outside} were outside the stated constraints, ranges or steps, by plain"
-        f" arithmetic (walls stand {MARGIN:g} of the ranges inside).",
+        f"Of all tested stimuli, {outside} were outside the specified constraints, ranges or steps, by plain"
+        f" arithmetic (walls are {MARGIN:g} of the ranges inside).",
         "",
         "## Time of a step",
         "",
-        "From an answer to the next rendering after 41 to 50 answers, in ms, on two cores that other work shared:",
+        "From a response to the next stimulus after 41 to 50 responses, in ms, on two cores shared with other work:",
         "the median, and the longest of ten. The constraint: the parameters' sum is at most a quarter of its largest.",
         "",
         "| parameters | a box | with a linear constraint |",

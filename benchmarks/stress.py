@@ -41,7 +41,7 @@ ALLOWED = {"ep": (0.25, 0.05, 0.2), "ep_corrected": (0.25, 0.05, 0.2), "exact": 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One fit: whether its certificate holds, what is wrong with it although it does, and its errors."""
+    """One fit: whether it is reported as converged, a fault nevertheless, and its errors."""
 
     case: Dataset
     converged: bool
@@ -131,10 +131,8 @@ def run(quick: bool, sizes: tuple[str, ...]) -> dict:
 
 
 def table(results) -> str:
-    head = (
-        "| inference | cases | hold | say not | wrong | checked | worst mean (prior sd) | worst evidence (relative) |"
-    )
-    rows = [head + " steps, median and most |", "|---|" + "---:|" * 8]
+    head = "| inference | cases | converged | not converged | wrong | checked | worst mean (prior sd) |"
+    rows = [head + " worst evidence (relative) | steps, median and most |", "|---|" + "---:|" * 8]
     for (inference, dtype), (outcomes, _) in results.items():
         good = [o for o in outcomes if o.converged]
         checked = [o for o in good if np.isfinite(o.mean_error)]
@@ -148,7 +146,7 @@ def table(results) -> str:
 
 
 def by_ratio(results) -> str:
-    """Fits that said no, of all, by prior sd over noise."""
+    """Fits reported as not converged, of all, by prior sd over noise."""
     head = ["up to 1e2", "1e2 to 1e4", "1e4 to 1e6", "above 1e6"]
     rows = ["| inference | " + " | ".join(head) + " |", "|---|" + "---:|" * len(head)]
     for (inference, dtype), (outcomes, _) in results.items():
@@ -162,14 +160,14 @@ def by_ratio(results) -> str:
 
 
 def failures(results) -> str:
-    """Every wrong fit, and those in float64 that said no."""
+    """Every wrong fit, and those in float64 that are reported as not converged."""
     wrong = [f"- **{inference}, {dtype}: {o.wrong}**: {o.case.name}"
              for (inference, dtype), (outcomes, _) in results.items() for o in outcomes if o.wrong]  # fmt: skip
     said = [f"- {inference}: {o.case.name}"
             for (inference, dtype), (outcomes, _) in results.items() for o in outcomes
             if dtype == "float64" and not o.converged]  # fmt: skip
-    return "\n".join(["Wrong, although the certificate holds:", "", *(wrong or ["- none"]), "",
-                      "Not found in float64, and said so:", "", *(said or ["- none"])])  # fmt: skip
+    return "\n".join(["Wrong, although reported as converged:", "", *(wrong or ["- none"]), "",
+                      "Reported as not converged in float64:", "", *(said or ["- none"])])  # fmt: skip
 
 
 def committees() -> str:
@@ -204,32 +202,32 @@ def _committee(count, prior, strongest, dtype):
     return np.max(np.abs(mean - true_mean) / size), np.max(np.abs(variance / true_variance - 1))
 
 
-PAGE = """Made by `python benchmarks/stress.py --write`; `tests/inference/test_stress.py` holds a part of it,
+PAGE = """Made by `python benchmarks/stress.py --write`; `tests/inference/test_stress.py` runs a part of it,
 `tests/inference/test_hostile.py` and `tests/inference/test_ep.py` a full grid of 540 milder cases.
 
 Noise 1e-4 to 10, theta 1e-3 to 1e5, prior variance 1e-6 to 1e6, gaps between thresholds 1e-4 to 1e2, 2 to 10
-categories, 1 to 20 dimensions, and answers ({counts}): a Latin hypercube. Answers independent of x, sensible, of one
-category, conflicting on five points, all on one point, on a line; predictions at asked points and elsewhere. "Hold":
-the certificate holds. "Wrong": it does, but a number is not finite, a variance is outside 0 and the prior's, or a
-reference disagrees (Laplace: the same approximation to 25 digits; the others: quadrature of the exact posterior where
-all points are equal or unconnected). "Worst" errors are over the fits that hold; those of EP are the method's own.
-
+categories, 1 to 20 dimensions, and responses ({counts}): a Latin hypercube. Responses independent of x, sensible, of
+one category, conflicting on five points, all on one point, on a line; predictions at tested points and elsewhere.
+"Converged": by its diagnostics. "Wrong": converged, but a number is not finite, a variance is outside 0 and the
+prior's, or a reference disagrees (Laplace: the same approximation to 25 digits; the others: quadrature of the exact
+posterior where all points are equal or unconnected). "Worst" errors are over the converged fits; those of EP are errors
+of the method.
 {table}
 
 {failures}
 
-Fits that said no, by the prior's standard deviation over the noise:
+Fits reported as not converged, by the prior's standard deviation over the noise:
 
 {ratios}
 
-So: keep the prior's sd below about 1e4 times the noise, in float32 below 1e2 times; beyond it answers that contradict
-each other ask for more digits than there are.
+Recommendation: a prior sd below about 1e4 times the noise, in float32 below 1e2 times; beyond it contradictory
+responses require more digits than the precision has.
 
 ### Committees
 
 1 to 10,000 experts who explain from 1e-12 to all but 1e-4 of the prior variance (1e-6, 1, 1e6), against 50 digits.
-Relative to the variance, and to the sum of the sizes of the mean's terms; in float32 the variances handed over are
-those that float32 can hold (with `combine_explained` nothing is lost there).
+Relative to the variance, and to the sum of the sizes of the mean's terms; in float32 the input variances are
+representable in float32 (with `combine_explained` nothing is lost there).
 
 {committees}
 """

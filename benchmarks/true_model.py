@@ -139,7 +139,7 @@ def likelihood(latent, q, thresholds):
 def table(rows):
     other = {(r["population"], r["seed"]): r["rules"] for r in map(json.loads, KNOWN.open()) if r["design"] == "24x25"}
     heads = ("the functions' population", "studies", "true model", "learnt-2", "learnt-1", "bcm")
-    heads += ("true model / bcm", "learnt-2 less true model")
+    heads += ("true model / bcm", "learnt-2 minus true model")
     lines = ["| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(heads) - 1)]
     for name in NAMES:
         here = {row["seed"]: row["regret"] for row in rows if row["population"] == name}

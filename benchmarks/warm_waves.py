@@ -126,7 +126,7 @@ def table(rows):
         cells = map(interval, (given, cold, waves, waves - given, waves - cold))
         lines.append([name if name == "all" else f"`{name}`", str(len(part)), *cells])
     return lined(
-        ["regret: populations", "studies", "fixed", "cold", "waves", "waves less fixed", "waves less cold"], lines
+        ["regret: populations", "studies", "fixed", "cold", "waves", "waves minus fixed", "waves minus cold"], lines
     )
 
 

@@ -271,13 +271,13 @@ PAGE = """Made by `python benchmarks/work_precision.py`, one thread, x86-64. Low
 
 Left, milliseconds for a fit and 200 predictions, by the number of answers. Right, the worst error over four kinds of
 data (separated, noisy with repeats, near-separable with noise 0.1, real people) and all numbers of answers, against
-`exact` with 65,536 samples: RMS over 200 points (class probabilities: 8). "Next point": how much less UCB, by the
-reference's posterior, the point has that the method would ask next. "exact, N": N samples.
+`exact` with 65,536 samples: RMS over 200 points (class probabilities: 8). "Next point": loss of UCB, by the
+reference's posterior, of the point that the method would choose next. "exact, N": N samples.
 
 {table}
 
-"ep_corrected" costs a little more than EP; its means, standard deviations and evidence err no more than those of
-`exact` with thousands of samples, at a small part of its price. Class probabilities it leaves as EP has them.
+"ep_corrected" costs a little more than EP; the errors of its means, standard deviations and evidence are no larger than
+those of `exact` with thousands of samples, at a small part of its cost. Its class probabilities are those of EP.
 Float32 changes none of the errors and saves a third of the time of `exact` ([below](#float32-against-float64)).
 
 ### By kind of data
@@ -288,22 +288,22 @@ real people 0.47.
 {kinds}
 
 EP stays within .002 in the mean and .03 in the evidence at noise 0.5 up to 25 answers, within .003 and .15 at noise
-0.1. With more answers its own error, the third cumulants of neighbouring answers, exceeds that
+0.1. With more responses its error, the third cumulants of neighbouring responses, exceeds that
 ([inference](../methods/inference.md)); the corrected one stays within.
 
 ### The committee machine
 
-100 answers of one latent function, shared out among people: the committee's map (BCM) against the pooled exact
-posterior (noise 0.5, theta 10, RMS over 200 points, in prior sds), by what the people's posteriors were fitted with.
-What is left with `exact` is the committee's own approximation, that people are independent given f at one point.
+100 responses of one latent function, divided among participants: the committee's map (BCM) against the pooled exact
+posterior (noise 0.5, theta 10, RMS over 200 points, in prior sds), by the inference of the individual posteriors.
+The error with `exact` is the approximation of the committee: participants are independent given f at one point.
 
 {bcm}
 
 ### The acquisition's optimum
 
-UCB maximised over the passive set of the preset `paper`, in 24 states of 5 to 25 answers: how much less than the best
-known (65,536 points inside and 16,384 on the walls, 24 of them polished), and the time of a choice. Candidates are
-inside the set plus a quarter more on its walls; "polished" are that many of the best. Sessions of two
+UCB maximised over the passive set of the preset `paper`, in 24 states of 5 to 25 responses: loss against the best
+known point (65,536 points inside and 16,384 on the walls, 24 of them polished), and the time of a choice. Candidates
+are inside the set plus a quarter more on its walls; "polished" are that many of the best. Sessions of two
 or three parameters screen a lattice instead.
 
 {optimum}
