@@ -45,7 +45,8 @@ MAY_IMPORT = {
     "study.formats": {"search"},
     "study.file": {"population.rules", "study.formats"},
     "study.tables": {"study.file"},
-    "study": {"population.judged", "study.tables"},
+    "study.importing": {"study.tables"},
+    "study": {"population.judged", "study.importing"},
     "study.estimate": {"acquisition", "study"},
     "study.results": {"study", "study.disk"},
     "study.robustness": {"hyperparameters", "study.estimate"},
@@ -103,7 +104,7 @@ ONLY_IN = {"matplotlib": {"report.figures"}, "serial": {"device.ports"}}
 WITHOUT_JAX = {
     *("errors", "device", "hardware_bridge", "identification.motor", "cli.device"),
     *("app.wire", "app.rigs", "app.server"),
-    *("population.rules", "study.disk", "study.formats", "study.file", "study.tables"),
+    *("population.rules", "study.disk", "study.formats", "study.file", "study.tables", "study.importing"),
     *("session.log", "session.export", "session.plan", "session.withdrawal"),
     *("mechanics.span", "search.box", "report.json_text", "app.pages.pace", "app.pages.session_views"),
 }

@@ -20,6 +20,7 @@ from hilbo.cli.aggregate import aggregate, robustness
 from hilbo.cli.cache import cache
 from hilbo.cli.demo import demo
 from hilbo.cli.device import commands as device
+from hilbo.cli.imports import imports
 from hilbo.cli.init import init
 from hilbo.cli.simulate import simulate
 from hilbo.cli.terminal.console import fail, say_remarks
@@ -84,6 +85,7 @@ app.command()(cli_live.session)
 app.command()(cli_live.doctor)
 app.command("try")(cli_tried.tried)
 app.command()(init)
+app.command("import")(imports)
 app.command()(cli_plan.plan)
 app.command()(session.export)
 app.add_typer(session.app_participants, name="participants")

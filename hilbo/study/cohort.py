@@ -3,7 +3,9 @@ batched fit takes."""
 
 import dataclasses
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,6 +25,8 @@ from hilbo.population.rules.registry import RULES
 from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
 from hilbo.study.formats.csv_file import FRAME, cell_pieces, cells_of
+from hilbo.study.importing.export import import_files
+from hilbo.study.importing.mapping import mapping_of, read_mapping
 from hilbo.study.tables.trials import TrialTable, check_recoding, trial_table
 
 __all__ = ["Cohort", "cohort_of", "read_trials"]
@@ -101,6 +105,7 @@ def read_trials(
     study: Study,
     material: str | None = None,
     *,
+    mapping: str | os.PathLike | Mapping[str, Any] | None = None,
     others: bool = True,
     say: Callable[[int], None] = lambda rows: None,
     note: Callable[[str], object] = warn_caller,
@@ -112,14 +117,27 @@ def read_trials(
     left out.
 
     **Arguments:** `path`: a CSV or Parquet file. `material`: select its rows; required if the table has several.
+    `mapping`: the mapping file of `hilbo import`, or its content, by which another program's export is converted first.
     `others`: keep the columns that hilbo does not use. `say`: called with the number of rows read so far. `note`:
     called with one sentence on participants none of whose responses is fitted, and one on ids that differ in capitals
     only; by default a warning. Raises `InputError`.
     """
-    cells = cell_pieces(path)
+    cells = cell_pieces(path) if mapping is None else [_converted(path, study, mapping, note)]
     table = trial_table(cells, study.file, material, source=str(path), others=others, say=say, note=note)
     table.rows.attrs[_CATEGORIES] = True
     return table.rows
+
+
+def _converted(
+    path: str | os.PathLike,
+    study: Study,
+    mapping: str | os.PathLike | Mapping[str, Any],
+    note: Callable[[str], object],
+) -> pd.DataFrame:
+    """The trial table of an export as text cells, its rows numbered from 1. Raises `InputError`."""
+    given = mapping_of(mapping, "mapping") if isinstance(mapping, Mapping) else read_mapping(Path(mapping))
+    made, _ = import_files([Path(path)], study.file, given, note=note)
+    return cells_of(made.table)
 
 
 def cohort_of(table: TrialTable | pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:

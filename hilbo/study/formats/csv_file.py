@@ -25,6 +25,7 @@ __all__ = [
     "answer_forms",
     "cell_pieces",
     "cells_of",
+    "check_decimal_marks",
     "numbers",
     "parameter_values",
     "place",
@@ -178,20 +179,37 @@ def parameter_values(text: pd.DataFrame, parameter: Parameter, source: str) -> p
     return numbers(text, parameter.name, source, f"{parameter.range_words}, the study's range", valid)
 
 
+def check_decimal_marks(text: pd.DataFrame, columns: Sequence[str], source: str) -> None:
+    """Raise `InputError` if some number of these columns of text cells has a decimal comma and another one a point, in
+    a file in which a comma may be the decimal mark; the message has both cells."""
+    if not text.attrs.get("decimal comma", False):
+        return
+    comma, point = _first_marked(text, columns, ","), _first_marked(text, columns, ".")
+    if comma and point:
+        where, what = max(comma[0], point[0]), comma[1] if comma[1] == point[1] else f"{comma[1]}, {point[1]}"
+        raise InputError(
+            f'{place(source, where)}{what} has decimal commas and decimal points ("{comma[2]}" and "{point[2]}");'
+            " write all numbers of the table with one of them."
+        )
+
+
+def _first_marked(text: pd.DataFrame, columns: Sequence[str], mark: str) -> tuple[int, str, str] | None:
+    """Row, column and text of the first number with this decimal mark; None if there is none."""
+    hits = (
+        (row, column, cell)
+        for column in columns
+        for row, cell in zip(text.index, text[column], strict=True)
+        if mark in cell and is_decimal(cell, mark)
+    )
+    return next(hits, None)
+
+
 def _with_points(text: pd.DataFrame, column: str, source: str) -> list[str]:
     """Cells of a column, with decimal commas replaced by points if the file is one whose numbers may have them. Raises
     `InputError` for commas and points in one column."""
+    check_decimal_marks(text, [column], source)
     cells = text[column].tolist()
-    if not text.attrs.get("decimal comma", False):
-        return cells
-    marks = {mark: next((i for i, cell in enumerate(cells) if is_decimal(cell, mark)), None) for mark in ",."}
-    if None not in marks.values():
-        rows = {mark: text.index[i] for mark, i in marks.items()}
-        raise InputError(
-            f"{place(source, max(rows.values()))}{column} has decimal commas and decimal points"
-            f' ("{text.at[rows[","], column]}" and "{text.at[rows["."], column]}"); write all with one of them.'
-        )
-    return [without_decimal_comma(cell) for cell in cells]
+    return [without_decimal_comma(cell) for cell in cells] if text.attrs.get("decimal comma", False) else cells
 
 
 def _number(cell: str) -> float:

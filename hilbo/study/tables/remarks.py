@@ -1,14 +1,16 @@
 """Remarks on the participants of a trial table, as sentences that `note` is called with."""
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 
 import pandas as pd
 
 from hilbo.study.formats.cell_text import alike, is_rounded
 
-__all__ = ["note_absent", "note_doubtful_ids"]
+__all__ = ["note_absent", "note_doubtful_ids", "note_forms"]
 
 _NAMED = 6  # people of whom a remark says the names
+_FEW_FORMS = 3  # of ids; more are random texts
 
 
 def note_absent(
@@ -36,3 +38,14 @@ def note_doubtful_ids(names: list[str], source: str, note: Callable[[str], objec
             f'{source}: participant "{rounded[0]}" looks like a number rounded by a spreadsheet; several'
             " participants may share it: export the ids as text."
         )
+
+
+def note_forms(names: Sequence[str], source: str, note: Callable[[str], object]) -> None:
+    """Call `note` with a sentence on ids of several forms, such as P01 and 1, one of which few participants have."""
+    forms: dict[str, list[str]] = {}
+    for name in names:
+        forms.setdefault(re.sub(r"\d+", "0", re.sub(r"[A-Za-z]+", "a", name)), []).append(name)
+    if 1 < len(forms) <= _FEW_FORMS:
+        first, *others = sorted(forms.values(), key=len, reverse=True)
+        odd = ", ".join(f'"{each[0]}"' for each in others)
+        note(f'{source}: ids have several forms, such as "{first[0]}" and {odd}; look whether they are participants.')

@@ -24,6 +24,7 @@ from hilbo.study.formats.cell_text import FORMULA_WORDS, ID_WORDS, check_text, f
 from hilbo.study.formats.csv_file import (
     FRAME,
     answer_forms,
+    check_decimal_marks,
     numbers,
     parameter_values,
     place,
@@ -160,6 +161,7 @@ def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, te
             table[column] = np.nan  # its place among the columns
         elif others or column in (*_KEY, study.random_effect, COLUMN, COLUMN_OF_SAMPLES):
             table[column] = [texts.setdefault(cell, cell) for cell in text[column]]
+    check_decimal_marks(text, ["trial", *(p.name for p in study.space.parameters if not p.levels)], source)
     whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0) & (v < 2**53))
     table["trial"] = whole.astype(int)
     check_people(text, source)
