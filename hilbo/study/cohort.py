@@ -5,7 +5,6 @@ import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -105,7 +104,7 @@ def read_trials(
     study: Study,
     material: str | None = None,
     *,
-    mapping: str | os.PathLike | Mapping[str, Any] | None = None,
+    mapping: str | os.PathLike | Mapping[str, object] | None = None,
     others: bool = True,
     say: Callable[[int], None] = lambda rows: None,
     note: Callable[[str], object] = warn_caller,
@@ -131,7 +130,7 @@ def read_trials(
 def _converted(
     path: str | os.PathLike,
     study: Study,
-    mapping: str | os.PathLike | Mapping[str, Any],
+    mapping: str | os.PathLike | Mapping[str, object],
     note: Callable[[str], object],
 ) -> pd.DataFrame:
     """The trial table of an export as text cells, its rows numbered from 1. Raises `InputError`."""
