@@ -221,7 +221,7 @@ def _command(place: Path, path: Path) -> str:
         return f"THROUGH, exit code {run.returncode}: {run.stderr}"
     if run.returncode == 0:
         if path.stem == "participants":
-            path.write_bytes(before)  # it was asked to be changed
+            path.write_bytes(before)  # as for a change
         return "accepted"
     words = [line for line in run.stderr.splitlines() if line.startswith("hilbo: ")]
     return "refused" if len(words) == 1 and not out.exists() else f"THROUGH, no sentence or a result: {run.stderr}"

@@ -42,7 +42,7 @@ __all__ = ["schedule_case"]
 QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 AGAIN = 12  # rounds after which a command counts as never done
 KINDS = {"delete": 3, "add": 3, "export": 3, "plan": 2, "init": 2, "aggregate": 1, "report": 0.4}
-DONE = ("nothing of participant", "exists already", "stands there already", "exist already", "is there already")
+DONE = ("nothing of participant", "exists already", "is there already", "exist already", "is there already")
 
 
 class Command:

@@ -131,7 +131,7 @@ def average(
     means, variances, _ = _checked_arrays(means, "variances", variances, 1.0)
     present = _present(mask, means)
     if concrete(present) and not np.any(present):
-        raise InputError("bcm: nobody is present; an average needs one participant at least.")
+        raise InputError("bcm: there are no participants; an average needs at least one.")
     return _averaged(means, variances, present)
 
 

@@ -20,7 +20,7 @@ def check_shapes(kernel: Kernel, likelihood: OrdinalProbit, trials: Trials, star
     """
     if trials.mask.ndim != 1:
         raise InputError(
-            f"fit: these trials hold {len(trials.mask)} people; fit those of one, or use jax.vmap with throw=False."
+            f"fit: these trials are of {len(trials.mask)} people; fit those of one, or use jax.vmap with throw=False."
         )
     if isinstance(kernel, Stationary):
         _check_kernel(kernel, trials.x.shape[-1])

@@ -234,13 +234,12 @@ def shortfall(certificate: Any, log_evidence: Scalar) -> str:
     beginning = f"found (residual {residual}), but"
     if bool(certificate.smallest_variance < certificate.variance_resolution):
         return (
-            f"{beginning} the answers leave a variance too small a part of the prior's for this precision to tell;"
-            f" {remedy}"
+            f"{beginning} the responses leave too small a fraction of the prior variance for this precision; {remedy}"
         )
     error, rounding = certificate.evidence_error, certificate.evidence_rounding
     if not bool(evidence_known(log_evidence, error, rounding)):
         off = f"{float(error + rounding):.3g}"
-        return f"{beginning} not closely enough for its evidence, which may be off by {off}; {remedy}"
+        return f"{beginning} not closely enough for its evidence, whose error is up to {off}; {remedy}"
     return (
         f"{beginning} not closely enough for the mean, which comes out differently in another order of sums; {remedy}"
     )

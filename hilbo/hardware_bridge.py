@@ -213,7 +213,7 @@ class Renderer:
         stop = self._link.stops if stop is None else stop
         current = self.in_force()
         if current is None:
-            raise DeviceError("The device has no set in force; send one first.")
+            raise DeviceError("The device has no active set; send one first.")
         self._link.heartbeat()
         self._buffer.take()
         order = {"set_id": current.set_id, "crc": current.crc, "boot_id": self.device.boot_id, "stop": stop}

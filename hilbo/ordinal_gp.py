@@ -161,13 +161,13 @@ class Posterior(eqx.Module):
         dtype = self.trials.x.dtype
         points = floats(x, dtype) if isinstance(x, jax.Array) else numbers("Posterior", "x", x, dtype)
         if self.trials.x.ndim != 2:
-            raise InputError("Posterior: holds several people; predict for each of them by jax.vmap.")
+            raise InputError("Posterior: several participants; predict for each of them by jax.vmap.")
         if points.ndim != 2 or points.shape[1] != self.trials.x.shape[1]:
             dim = self.trials.x.shape[1]
             raise InputError(f"Posterior: x has shape {points.shape}; give points of shape (m, {dim}).")
         if concrete(points) and not np.all(np.isfinite(points)):
             row = int(np.argwhere(~np.isfinite(points))[0, 0])
-            raise InputError(f"Posterior: x[{row}] holds a value that is not finite; give points of the unit cube.")
+            raise InputError(f"Posterior: x[{row}] has a value that is not finite; give points of the unit cube.")
         if concrete(points):
             remark_outside("Posterior", self.gp.kernel, np.asarray(points))
         return points

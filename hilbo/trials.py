@@ -96,7 +96,7 @@ class Trials(eqx.Module):
         table. Traced values are not checked; if a full table is traced, all x become NaN.
         """
         if self.mask.ndim != 1:
-            raise InputError(f"Trials: holds {len(self.mask)} people; append to the answers of one, or use jax.vmap.")
+            raise InputError(f"Trials: {len(self.mask)} participants; append to the responses of one, or use jax.vmap.")
         point, dim = numbers("Trials", "x", x, self.x.dtype), self.x.shape[-1]
         if point.shape != (dim,):
             raise InputError(f"Trials: x has shape {point.shape}; append one point, of shape ({dim},).")
@@ -105,7 +105,7 @@ class Trials(eqx.Module):
         if concrete(q):
             _check_categories(np.atleast_1d(_array("q", q)))
         if concrete(self.mask) and np.all(self.mask):
-            raise InputError(f"Trials: all {self.capacity} rows hold an answer; make it with a larger capacity.")
+            raise InputError(f"Trials: all {self.capacity} rows have a response; make it with a larger capacity.")
         row = jnp.argmin(self.mask)
         return Trials(
             jnp.where(jnp.all(self.mask), jnp.nan, self.x.at[row].set(point)),
@@ -152,7 +152,7 @@ def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:
         )
     if not np.all(np.isfinite(points)):
         row = int(np.argwhere(~np.isfinite(points))[0, 0])
-        raise InputError(f"Trials: x[{row}] holds a value that is not finite; remove that answer or fix it.")
+        raise InputError(f"Trials: x[{row}] has a value that is not finite; remove that response or fix it.")
     if len(answers):
         _check_categories(answers)
 
@@ -160,4 +160,4 @@ def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:
 def _check_categories(answers: np.ndarray) -> None:
     """Raise `InputError` for categories that are not integers from 0 to the largest 32-bit integer."""
     if not np.issubdtype(answers.dtype, np.integer) or answers.min() < 0 or answers.max() > np.iinfo(np.int32).max:
-        raise InputError("Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).")
+        raise InputError("Trials: q must contain the categories as integers from 0 (lowest) to C - 1 (highest).")

@@ -158,7 +158,7 @@ def test_rows_of_somebody_absent_have_no_influence():
 
 def test_nobody_has_no_average():
     halves = jnp.full((2, 2), 0.5)
-    with pytest.raises(InputError, match="nobody is present; an average needs one participant"):
+    with pytest.raises(InputError, match="there are no participants; an average needs at least one"):
         bcm.average(halves, halves, mask=np.zeros(2, bool))
     assert np.isnan(jax.jit(lambda mask: bcm.average(halves, halves, mask=mask))(np.zeros(2, bool))).all()
 

@@ -156,7 +156,7 @@ def test_where_many_stimuli_are_equally_good_no_single_one_is_judged():
     one = jnp.ones(())
     region = optimum_region(study, RuleMap("pooled", "exact", None, posterior, one, 2.0 * one), (), 0, 100)
     (sentence,) = region_sentences(region, study.one_optimum)
-    assert region.hills == () and "many renderings are equally good" in sentence
+    assert region.hills == () and "many stimuli are equally good" in sentence
     inside, outside = (np.abs(posterior.mean(jnp.asarray(x)) + 0.15) for x in (region.points, region.others))
     assert np.median(inside) < np.median(outside)
     with pytest.raises(InputError, match="many stimuli are as good as the optimum"):

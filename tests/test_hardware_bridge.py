@@ -115,7 +115,7 @@ def test_a_device_with_another_set_in_force_is_found_out(lie):
     peer = Peer()
     with peer.open(**PATIENT) as device:
         peer.lie = lie
-        with pytest.raises(DeviceError, match="another set in force than was sent"):
+        with pytest.raises(DeviceError, match="is not the one that was sent"):
             device.send(**A)
 
 
@@ -201,7 +201,7 @@ def test_a_study_that_counts_on_more_damping_is_refused():
     assert exact < 0.95
     with Peer().open(damping=0.95, **PATIENT) as device:
         assert device.device.damping_N_s_per_m == exact
-    with pytest.raises(InputError, match=r"counts on 0.9501 N.s/m of damping and the device has 0.95"):
+    with pytest.raises(InputError, match=r"assumes 0.9501 N.s/m of damping and the device has 0.95"):
         Peer().open(damping=0.9501, **PATIENT)
 
 

@@ -85,7 +85,7 @@ MISTAKES = {
     ),
     "a point that is no number": (
         lambda p, s: p.predict([[0.1, 0.2], [0.3, np.nan]]),
-        "Posterior: x[1] holds a value that is not finite; give points of the unit cube.",
+        "Posterior: x[1] has a value that is not finite; give points of the unit cube.",
     ),
     "a seed below 0": (
         lambda p, s: Session.start(s.study, seed=-1),
@@ -105,9 +105,9 @@ MISTAKES = {
         lambda p, s: p.class_probabilities(jnp.full(2, 0.5)),
         "Posterior: x has shape (2,); give points of shape (m, 2).",
     ),
-    "several people": (
+    "several participants": (
         lambda p, s: jax.vmap(lambda _: p)(jnp.arange(2)).predict(np.zeros((1, 2))),
-        "Posterior: holds several people; predict for each of them by jax.vmap.",
+        "Posterior: several participants; predict for each of them by jax.vmap.",
     ),
     "complex points": (
         lambda p, s: Trials.from_arrays(np.full((1, 2), 0.5j), np.array([0])),
@@ -127,7 +127,7 @@ MISTAKES = {
     ),
     "a category beyond 32 bits": (
         lambda p, s: Trials.from_arrays(np.zeros((1, 2)), np.array([2**32 + 1])),
-        "Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).",
+        "Trials: q must contain the categories as integers from 0 (lowest) to C - 1 (highest).",
     ),
     "one coordinate of two": (
         lambda p, s: p.trials.append(jnp.array([0.5]), 1),
@@ -135,7 +135,7 @@ MISTAKES = {
     ),
     "half a category": (
         lambda p, s: p.trials.append(jnp.array([0.5, 0.5]), 1.5),
-        "Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).",
+        "Trials: q must contain the categories as integers from 0 (lowest) to C - 1 (highest).",
     ),
     "a point that is nowhere": (
         lambda p, s: p.trials.append([0.5, np.nan], 1),
@@ -143,15 +143,15 @@ MISTAKES = {
     ),
     "one answer more than there is room for": (
         lambda p, s: Trials.from_arrays(np.zeros((1, 2)), np.array([0]), 1).append([0.5, 0.5], 1),
-        "Trials: all 1 rows hold an answer; make it with a larger capacity.",
+        "Trials: all 1 rows have a response; make it with a larger capacity.",
     ),
-    "one answer to several people": (
+    "one answer to several participants": (
         lambda p, s: jax.vmap(lambda _: p.trials)(jnp.arange(2)).append([0.5, 0.5], 1),
-        "Trials: holds 2 people; append to the answers of one, or use jax.vmap.",
+        "Trials: 2 participants; append to the responses of one, or use jax.vmap.",
     ),
-    "the answers of several people": (
+    "the answers of several participants": (
         lambda p, s: fit(p.gp, jax.vmap(lambda _: p.trials)(jnp.arange(2))),
-        "fit: these trials hold 2 people; fit those of one, or use jax.vmap with throw=False.",
+        "fit: these trials are of 2 people; fit those of one, or use jax.vmap with throw=False.",
     ),
     "a category below 0": (
         lambda p, s: fit(p.gp, with_first(p.trials, "q", -1)),
@@ -185,7 +185,7 @@ MISTAKES = {
     ),
     "the best of nothing": (
         lambda p, s: s.best(),
-        "Session: there are no answers yet, and so no best rendering; tell one first.",
+        "Session: there are no responses yet, hence no best stimulus; add one with tell() first.",
     ),
     "a seed of more than 64 bits": (
         lambda p, s: Session.start(s.study, seed=2**63),

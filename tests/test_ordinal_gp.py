@@ -194,10 +194,10 @@ def test_the_parts_of_a_prediction_agree():
     [
         (np.zeros((3, 2)), np.zeros(2, int), None, r"x has shape \(3, 2\) and q has shape \(2,\); give x as"),
         (np.zeros(3), np.zeros(3, int), None, r"x has shape \(3,\) .* give x as \(n, d\)"),
-        (np.array([[0.0], [np.nan]]), np.zeros(2, int), None, r"x\[1\] holds a value that is not finite"),
-        (np.array([[np.inf], [0.0]]), np.zeros(2, int), None, r"x\[0\] holds a value that is not finite"),
-        (np.zeros((2, 1)), np.array([0.0, 1.0]), None, "q must hold the categories as integers from 0"),
-        (np.zeros((2, 1)), np.array([0, -1]), None, "q must hold the categories as integers from 0"),
+        (np.array([[0.0], [np.nan]]), np.zeros(2, int), None, r"x\[1\] has a value that is not finite"),
+        (np.array([[np.inf], [0.0]]), np.zeros(2, int), None, r"x\[0\] has a value that is not finite"),
+        (np.zeros((2, 1)), np.array([0.0, 1.0]), None, "q must contain the categories as integers from 0"),
+        (np.zeros((2, 1)), np.array([0, -1]), None, "q must contain the categories as integers from 0"),
         (np.zeros((2, 1)), np.zeros(2, int), 1, "capacity is 1, but 2 answers need at least 2"),
         (np.zeros((0, 1)), np.zeros(0, int), 0, "capacity is 0, but 0 answers need at least 1"),
     ],
@@ -229,7 +229,7 @@ def test_one_answer_too_many_is_not_forgotten_in_silence():
     trials = answers(data, CAPACITY)
     while not trials.mask.all():
         trials = trials.append(jnp.full(3, 0.5), 2)
-    with pytest.raises(InputError, match=f"all {CAPACITY} rows hold an answer; make it with a larger capacity"):
+    with pytest.raises(InputError, match=f"all {CAPACITY} rows have a response; make it with a larger capacity"):
         trials.append(jnp.full(3, 0.5), 2)
     full = jax.jit(lambda trials: trials.append(jnp.full(3, 0.5), 2))(trials)  # traced, nobody knows that it is full
     assert np.all(np.isnan(full.x))
@@ -252,8 +252,8 @@ def test_a_failed_fit_says_so():
     ("changed", "words"),
     [
         ({"residual": 1.0}, "not found: its residual is 1 after"),
-        ({"smallest_variance": 0.0}, "but the answers leave a variance too small"),
-        ({"evidence_error": 7.0}, "not closely enough for its evidence, which may be off by 7"),
+        ({"smallest_variance": 0.0}, "but the responses leave too small"),
+        ({"evidence_error": 7.0}, "not closely enough for its evidence, whose error is up to 7"),
         ({}, "not closely enough for the mean"),
     ],
 )

@@ -1,4 +1,4 @@
-"""hilbo/data/columns.csv as a page: `python docs/site/columns.py` writes it anew."""
+"""hilbo/data/columns.csv as a page: `python docs/site/columns.py` writes it."""
 
 from pathlib import Path
 

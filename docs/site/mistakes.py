@@ -1,4 +1,4 @@
-"""Typical mistakes, and what hilbo says of each when made: `python docs/site/mistakes.py` writes the page anew."""
+"""Common mistakes and the error message of each: `python docs/site/mistakes.py` writes the page."""
 
 import tempfile
 import tomllib
@@ -43,7 +43,7 @@ P02,1,similar,8.25,6.3,0.3
 """
 IN_STUDIES = {  # what is wrong, and how the good file becomes so
     "a misspelt key": ("noise = 0.5", "nose = 0.5"),
-    "keys that are missing": ('name = "memory foam"\n', ""),
+    "missing keys": ('name = "memory foam"\n', ""),
     "a text where a number belongs": ("theta = 30.0", 'theta = "long"'),
     "a range upside down": ("low = 1.0\nhigh = 32.0", "low = 32.0\nhigh = 1.0"),
     "thresholds that do not rise": ("[-0.5, 0.5]", "[0.5, -0.5]"),
@@ -51,15 +51,15 @@ IN_STUDIES = {  # what is wrong, and how the good file becomes so
     "theta and length": ("theta = 30.0", "theta = 30.0\nlength = 0.13"),
     "another unit": ('unit = "N/mm"', 'unit = "N/m"'),
     "more space-filling trials than trials": ("[gp]", "[selection]\nspace_filling = 30\n[gp]"),
-    "a rule that there is not": ("[gp]", '[aggregation]\nrule = "mean"\n[gp]'),
+    "an unknown rule": ("[gp]", '[aggregation]\nrule = "mean"\n[gp]'),
 }
 IN_TABLES = {
-    "a column that is missing": ("alpha", "order"),
-    "an answer that the study has not": ("similar", "near"),
+    "a missing column": ("alpha", "order"),
+    "an unknown response": ("similar", "near"),
     "a value out of the range": ("20.5", "205"),
     "a decimal comma in a table with commas": ("20.5", '"20,5"'),
     "a trial twice": ("P01,2", "P01,1"),
-    "a trial that is no number": ("P02,1", "P02,first"),
+    "a trial that is not a number": ("P02,1", "P02,first"),
     "a row with a cell too few": (",0.3\n", "\n"),
     "a name where an id belongs": ("P02", "Jane Doe"),
     "a cell that a spreadsheet would run": ("P02", "=P02"),
@@ -70,13 +70,13 @@ CALLS = {
     "x and q of different lengths": "Trials.from_arrays(x, q[:3])",
     "one point in place of several": "posterior.predict(x[0])",
     "points of another space": "posterior.predict(x[:, :1])",
-    "the best of no answers": "Session.start(study).best()",
-    "an answer that the study has not": 'Session.start(study).tell("near")',
+    "the optimum without responses": "Session.start(study).best()",
+    "an unknown response": 'Session.start(study).tell("near")',
 }
 
 
 def sentence(act: Callable[[], object]) -> str:
-    """What is said of a mistake."""
+    """The error message of a mistake."""
     try:
         act()
     except InputError as error:
@@ -85,7 +85,7 @@ def sentence(act: Callable[[], object]) -> str:
 
 
 def mistakes() -> Iterator[tuple[str, str, str, str]]:
-    """Section, what is wrong, how it is written, what is said."""
+    """Section, mistake, input, error message."""
     for what, (good, bad) in IN_STUDIES.items():
         text = STUDY.replace(good, bad, 1)
         said = sentence(lambda text=text: checked(tomllib.loads(text), "study.toml", lambda file: file, text))
@@ -120,7 +120,7 @@ def _names() -> dict[str, object]:
 def page() -> str:
     """The page as Markdown."""
     lines = [
-        "# Typical mistakes, and what hilbo says",
+        "# Common mistakes and their error messages",
         "",
         "Bad input gets one sentence: where, what, and what to do. A command ends with exit code 2 and writes nothing.",
         "This page is made by `python docs/site/mistakes.py`; a test compares it.",
@@ -129,7 +129,7 @@ def page() -> str:
     for here, what, written, said in mistakes():
         if here != section:
             section = here
-            lines += ["", f"## {here}", "", "| mistake | written | said |", "|---|---|---|"]
+            lines += ["", f"## {here}", "", "| mistake | input | error message |", "|---|---|---|"]
         cells = (what, f"`{' '.join(written.split())}`", said)
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(lines) + "\n"

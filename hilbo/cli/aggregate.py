@@ -41,33 +41,42 @@ def aggregate(
     trials: Table,
     study: StudyOption,
     out: Out,
-    seed: Annotated[int, seed_option("of the points among which the optimum is sought")] = 0,
-    material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
-    participants: Annotated[str | None, typer.Option(help="Only these, separated by commas.")] = None,
-    first: Annotated[int | None, typer.Option(min=1, help="Only everybody's first so many trials.")] = None,
-    individuals: Annotated[bool, typer.Option(help="Seek everybody's own optimum: most of the work.")] = True,
+    seed: Annotated[int, seed_option("of the candidate points of the optimum")] = 0,
+    material: Annotated[str | None, typer.Option(help="Material of the table.")] = None,
+    participants: Annotated[str | None, typer.Option(help="Use only these participants, separated by commas.")] = None,
+    first: Annotated[int | None, typer.Option(min=1, help="Use only the first N trials of each participant.")] = None,
+    individuals: Annotated[
+        bool, typer.Option(help="Also compute each participant's own optimum (the slowest step).")
+    ] = True,
     rule: Annotated[
         str | None,
         typer.Option(
-            help=f"Rule of aggregation in place of the study file's: {', '.join(GIVEN)}, or"
+            help=f"Aggregation method in place of the study file's: {', '.join(GIVEN)}, or"
             f" {' and '.join(RECIPES)}, which learn [gp] too."
         ),
     ] = None,
     compare: Annotated[
-        bool, typer.Option("--compare", help="Besides, compare all rules: comparison.json, comparison.csv, figures.")
+        bool,
+        typer.Option(
+            "--compare",
+            help="Also compare all methods by cross-validation; writes comparison.json, comparison.csv, figures.",
+        ),
     ] = False,
-    devices: Annotated[int | None, typer.Option(min=1, help="Deal people to so many cores of the CPU.")] = None,
+    devices: Annotated[
+        int | None, typer.Option(min=1, help="Number of CPU devices to distribute participants over.")
+    ] = None,
     distributed: Annotated[
-        bool, typer.Option("--distributed", help="One of several processes: under srun, mpirun, or as the next three.")
+        bool,
+        typer.Option("--distributed", help="Run as one of several processes (srun, mpirun, or --coordinator ...)."),
     ] = False,
     coordinator: Annotated[
         str | None, typer.Option(envvar="JAX_COORDINATOR_ADDRESS", help="HOST:PORT of process 0.")
     ] = None,
     processes: Annotated[
-        int | None, typer.Option(min=1, envvar="JAX_NUM_PROCESSES", help="How many processes there are.")
+        int | None, typer.Option(min=1, envvar="JAX_NUM_PROCESSES", help="Number of processes.")
     ] = None,
     process_id: Annotated[
-        int | None, typer.Option(min=0, envvar="JAX_PROCESS_ID", help="Which one this is, from 0.")
+        int | None, typer.Option(min=0, envvar="JAX_PROCESS_ID", help="Index of this process (0-based).")
     ] = None,
     force: Force = False,
     as_json: Json = False,
@@ -111,11 +120,11 @@ def robustness(
     trials: Table,
     study: StudyOption,
     out: Out,
-    seed: Annotated[int, seed_option("of the points among which optima are sought")] = 0,
+    seed: Annotated[int, seed_option("of the candidate points of the optima")] = 0,
     learn: Annotated[
-        str, typer.Option(help="Optimised hyperparameters, separated by commas; a rule that learns them learns all.")
+        str, typer.Option(help="Hyperparameters to optimise, separated by commas; learnt-1 to learnt-3 optimise all.")
     ] = "theta,noise,thresholds",
-    material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
+    material: Annotated[str | None, typer.Option(help="Material of the table.")] = None,
     pilot: Annotated[
         bool,
         typer.Option("--pilot", help="Print the optimised hyperparameters as [gp], with 95 % intervals, for a study."),
@@ -136,10 +145,10 @@ def robustness(
 
         if pilot:
             pilots.check_pilot(chosen, cohort)
-        say("hyperparameters by maximum evidence")
+        say("optimising the hyperparameters (maximum evidence)")
         comparison = check(chosen, cohort, seed, learn=tuple(name.strip() for name in learn.split(",")))
         sure = pilots.pilot(chosen, cohort, comparison.hyperparameters, say) if pilot else None
-        say("maps, figures and report")
+        say("computing maps, drawing figures and writing the report")
         content = write_robustness(chosen, cohort, comparison, folder, seed, [*flagged, *left_out], sure)
     finish(content, out, as_json, say.printed)
     if pilot and not as_json:
@@ -182,7 +191,7 @@ def _only_material(pieces: list[Any], source: Path) -> str | None:
     `InputError` if they name several."""
     named = list(dict.fromkeys(name for cells in pieces if "material" in cells for name in cells["material"]))
     if len(named) > 1:
-        raise InputError(f"{source}: holds {len(named)} materials ({', '.join(named)}); choose one with --material.")
+        raise InputError(f"{source}: contains {len(named)} materials ({', '.join(named)}); choose one with --material.")
     if not named:
         remark(f"{source}: names no material; it is read by the study's own tables, and none of [materials].")
     return named[0] if named else None
@@ -264,7 +273,7 @@ def _analysed_together(
 
     with team.sharded():
         population = _analysed(study, cohort, seed, say, whole=False, individuals=individuals)
-        say("the population map on a grid")
+        say("computing the population map on a grid")
         grid = population_grid(population)
     return host_local(population), grid
 
@@ -290,7 +299,7 @@ def _written(
         from hilbo.report.study.comparison import write_comparison
         from hilbo.study.analysis.rule_comparison import compare as compare_rules
 
-        say("every rule, with each person left out")
+        say("cross-validating all methods (leave-one-participant-out)")
         rules = compare_rules(study, population.aggregate, population.seed)
         compared = write_comparison(study, population.aggregate, rules, folder)
         beside = {"comparison": compared.section, "pictures": compared.pictures}

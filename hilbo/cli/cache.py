@@ -13,7 +13,9 @@ __all__ = ["cache"]
 
 
 def cache(
-    clear: Annotated[bool, typer.Option("--clear", help="Drop everything; it is made again when needed.")] = False,
+    clear: Annotated[
+        bool, typer.Option("--clear", help="Delete the cache; programs are compiled again when needed.")
+    ] = False,
     as_json: JsonToo = False,
 ) -> None:
     """Show the cache of compiled functions (folder, number, size), or clear it."""

@@ -12,7 +12,7 @@ __all__ = ["demo"]
 
 def demo(
     out: Out = Path("demo-results"),
-    seed: Annotated[int, seed_option("of the simulated people and of the points among which optima are sought")] = 0,
+    seed: Annotated[int, seed_option("of the simulated participants and of the candidate points of the optima")] = 0,
     force: Force = False,
 ) -> None:
     """Aggregate a real data set, then simulate a whole haptic study of known truth and report on it.
@@ -70,7 +70,7 @@ def _print_demo(real: dict[str, Any], simulated: dict[str, Any], out: Path) -> N
     row("mean of optima", "mean_of_optima", simulated["mean_of_optima"], "10.5 %, no")
     row("mean of maps", "average", simulated["alternatives"]["average"], "")
     console.print(table)
-    console.print("Individuals: median and quartiles. Passive by so many N.s/m of damping more than the least.")
+    console.print("Individuals: median and quartiles. Passivity margin: excess damping in N.s/m.")
     top = truth["top_answers"]
     console.print(f'"close" answers of 25: {top["mean"]:.2f} ± {top["sd"]:.2f} (paper: 5.96 ± 4.47)\n')
     for name in PARTS:

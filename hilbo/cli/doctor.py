@@ -105,7 +105,7 @@ def _disk(folder: Path) -> Check:
         free = shutil.disk_usage(place).free / 1e6
     except OSError as error:
         return Check("disk", "bad", f"{place}: {error.strerror}", "choose a folder for logs that can be written")
-    words = f"{place}: {free:,.0f} MB free, a line is safe on the disk after {1000 * took:.1f} ms"
+    words = f"{place}: {free:,.0f} MB free, log write latency (fsync) {1000 * took:.1f} ms"
     return _check("disk", words, free < _ROOM and f"make {_ROOM} MB of room, or choose another folder")
 
 
@@ -224,7 +224,7 @@ def _step(study: Any) -> Check:
         begun = time.perf_counter()
         session = session.tell(study.responses[0])
         took = time.perf_counter() - begun
-    words = f"{1000 * took:.0f} ms from an answer to the next point, where nothing was chosen ahead"
+    words = f"trial selection without look-ahead takes {1000 * took:.0f} ms"
     return _check("time of a step", words, took > _SLOW and "close other programs", "note")
 
 
@@ -272,9 +272,9 @@ def _stimulus(file: Any) -> Iterator[Check]:
     table, parameters = file.stimulus, file.space.parameters
     off = ", ".join(f"{p.name} {table.tolerance_words(p)}" for p in parameters if not p.levels)
     words = f"a {table.by} presents, and confirms within {table.within:g} s"
-    words += f"; values may be off by {off}" if off else ""
+    words += f"; tolerance of confirmed values: {off}" if off else ""
     stated = "stimulus" in json.loads(file.content)
-    yield _check("stimulus", words, not stated and "say so in a table [stimulus]", "note")
+    yield _check("stimulus", words, not stated and "add a table [stimulus]", "note")
     if file.space.mechanics is None:
         left = [key for key in ("title", "hello", "feel_reference", "feel_test") if key not in file.session.texts]
         words = f"{len(left)} speak of feeling a device: {', '.join(left)}" if left else "the study's own"
@@ -309,7 +309,7 @@ def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator
     measured = check.measured
     if measured is None or measured.why:
         why = "nothing was measured" if measured is None else measured.why
-        yield Check("the program's stop", "bad", why, "fix the program; docs/guides/stimulus.md has what it has to say")
+        yield Check("the program's stop", "bad", why, "fix the program; docs/guides/stimulus.md has the messages")
         return
     for name, times in (("renderings", measured.presented), ("the program's stop", measured.stopped)):
         slowest = f"{len(times)} times, the slowest after {1000 * max(times):.0f} ms"
@@ -330,7 +330,7 @@ def _loopback(device: Any) -> Check:
 
 def _damping(has: float, needs: float) -> Check:
     """Whether the device's damping (N·s/m) is at least that of the study."""
-    words = f"the study counts on {needs:g} N·s/m, the device says {has:g}"
+    words = f"the study assumes {needs:g} N·s/m, the device reports {has:g}"
     fix = "measure it (`hilbo device measure-damping`), then lower the study's"
     return _check("damping", words, has < needs * (1 - 1e-6) and fix)
 

@@ -19,25 +19,25 @@ __all__ = ["init"]
 
 def init(
     study: Annotated[Path, typer.Argument(help="Study file to write.")] = Path("study.toml"),
-    name: Annotated[str | None, typer.Option(help="What the study is called; by default as its file.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the study; by default that of the file.")] = None,
     parameter: Annotated[
         list[str] | None,
         typer.Option(
-            help="NAME=LOW:HIGH:UNIT, with :log behind it if steps are ratios, or :integer; or NAME=LEVEL,LEVEL,LEVEL;"
-            " or NAME=LOW<MEDIUM<HIGH for levels in an order. Once for each."
+            help="NAME=LOW:HIGH:UNIT, followed by :log for a logarithmic scale, or by :integer; or"
+            " NAME=LEVEL,LEVEL,LEVEL; or NAME=LOW<MEDIUM<HIGH for ordered levels. Repeatable."
         ),
     ] = None,
     constraint: Annotated[
         list[str] | None,
-        typer.Option(
-            help="What parameters keep together, in their units: 'a + 2*b <= 3', '0 <= a - b <= 1'. Once for each."
-        ),
+        typer.Option(help="Linear constraint in physical units, e.g. 'a + 2*b <= 3' or '0 <= a - b <= 1'. Repeatable."),
     ] = None,
-    responses: Annotated[str, typer.Option(help="The answers, lowest first.")] = "different,similar,close",
-    goal: Annotated[str, typer.Option(help="The answer that is searched for; by default the highest.")] = "",
-    trials: Annotated[int, typer.Option(min=1, help="How many trials a participant has.")] = 25,
-    device: Annotated[bool, typer.Option("--device", help="Our device renders; else a program presents.")] = False,
-    by: Annotated[str, typer.Option(help="Without --device: a program presents, or a person by hand.")] = "program",
+    responses: Annotated[str, typer.Option(help="Response categories, lowest first.")] = "different,similar,close",
+    goal: Annotated[str, typer.Option(help="The response to maximise; by default the highest.")] = "",
+    trials: Annotated[int, typer.Option(min=1, help="Number of trials per participant.")] = 25,
+    device: Annotated[
+        bool, typer.Option("--device", help="Use the hilbo haptic device instead of your own stimulus program.")
+    ] = False,
+    by: Annotated[str, typer.Option(help="Without --device: who presents, program or person.")] = "program",
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
     """Write a commented study file with the name, parameters and answers given."""
@@ -48,7 +48,7 @@ def init(
     if by not in ("program", "person"):
         raise InputError(f'--by is "{by}"; it must be program or person.')
     if device and by == "person":
-        raise InputError("--by person stands beside --device; leave one of them out.")
+        raise InputError("--by person and --device exclude each other; leave one of them out.")
     answers = tuple(text.strip() for text in responses.split(","))
     new = NewStudy(name or study.stem, parameters, answers, trials, device, by, goal.strip(), tuple(constraint or ()))
     text = study_text(new)

@@ -47,7 +47,9 @@ class Served(NamedTuple):
     """Options: where a session is served, and where its log goes."""
 
     logs: Annotated[Path, typer.Option("--logs", help="Folder of the session logs.")] = Path("logs")
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the server; 0 takes any.")] = _PORT
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the server; 0 for any free one.")] = (
+        _PORT
+    )
     lan: Annotated[bool, typer.Option("--lan", help="Reachable from the network, by one-time links.")] = False
     gap: Annotated[float, typer.Option("--gap", min=0.0, help="Pause between two trials, s.")] = 0.7
     browse: Annotated[bool, typer.Option("--open", help="Open the experimenter's page in this computer's browser.")] = (
@@ -65,14 +67,17 @@ def session(
         str | None, typer.Option("--session", help="Label of the session; by default 1, or the plan's.")
     ] = None,
     plan: Annotated[Path | None, typer.Option(help="Plan of the study, from `hilbo plan`.")] = None,
-    material: Annotated[str | None, typer.Option(help="Which of the study's materials.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the session that has a log.")] = False,
+    material: Annotated[str | None, typer.Option(help="Material of the study.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume an interrupted session.")] = False,
     people: Annotated[Path | None, typer.Option(help="participants.csv; by default the one among the logs.")] = None,
     warm_start: Annotated[
-        Path | None, typer.Option("--warm-start", help="map.nc of a population, that selection begins with.")
+        Path | None, typer.Option("--warm-start", help="map.nc of a population, as the initial map of trial selection.")
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Nobody takes part: no consent is looked for, and the log says so.")
+        bool,
+        typer.Option(
+            "--dry-run", help="Test run without a participant; consent is not checked and the log is flagged."
+        ),
     ] = False,
     seed: Annotated[
         int | None, seed_option("of the points that are chosen; by default one for each participant, or the plan's")
@@ -193,7 +198,7 @@ def doctor(
     logs: Annotated[Path, typer.Option("--logs", help="Folder of the session logs.")] = Path("logs"),
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the server.")] = _PORT,
     stimulus: Annotated[
-        bool, typer.Option("--stimulus", help="Ask the program that presents for renderings, and stop it in them.")
+        bool, typer.Option("--stimulus", help="Test the stimulus program: presentations and stops.")
     ] = False,
     as_json: JsonToo = False,
 ) -> None:

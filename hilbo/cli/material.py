@@ -11,8 +11,8 @@ from hilbo.errors import InputError
 
 __all__ = ["identify", "passivity"]
 
-Taps = Annotated[int, typer.Option("--N", min=1, help="Past samples of the rendering.")]
-Period = Annotated[float, typer.Option("--T", help="Sampling time of the rendering, s.")]
+Taps = Annotated[int, typer.Option("--N", min=1, help="Past samples of the model.")]
+Period = Annotated[float, typer.Option("--T", help="Sampling time of the model, s.")]
 Memory = Annotated[str, typer.Option(help='"short" (N samples) or "full".')]
 
 
@@ -38,7 +38,7 @@ def identify(
     compare: Annotated[bool, typer.Option(help="Refit with other numbers of past samples.")] = True,
     model: Annotated[str, typer.Option(help='For moduli: "fosls" or "fractional-maxwell".')] = "fosls",
     weights: Annotated[str | None, typer.Option(help='For moduli: residuals over the "range", or "relative".')] = None,
-    longest: Annotated[float | None, typer.Option(help="Use only the first so many seconds.")] = None,
+    longest: Annotated[float | None, typer.Option(help="Use only the first seconds of each test, s.")] = None,
     seed: Annotated[int, seed_option("of bootstrap resamples")] = 0,
     force: Force = False,
     as_json: Json = False,
@@ -71,7 +71,7 @@ def identify(
         result = characterise.characterise(
             measurements.tests, chosen, seed, choices, say, find_filter=instrument["corner"] == "auto"
         )
-        say("figures and report")
+        say("drawing figures and writing the report")
         content = report_material.identification_result(
             table.name, measurements.tests, result, measurements.stiffness_unit, measurements.notes, damping
         )
@@ -110,16 +110,16 @@ def passivity(
     K1: Annotated[float | None, typer.Option("--K1", help="N/mm.", show_default=False)] = None,
     B1: Annotated[float | None, typer.Option("--B1", help="N.s^alpha/mm.", show_default=False)] = None,
     alpha: Annotated[float | None, typer.Option("--alpha", help="Order.", show_default=False)] = None,
-    K0: Annotated[float | None, typer.Option("--K0", help="N/mm; else from --K-eff.")] = None,
+    K0: Annotated[float | None, typer.Option("--K0", help="N/mm; by default from --K-eff.")] = None,
     K_eff: Annotated[float | None, typer.Option("--K-eff", help="Effective stiffness H(1), N/mm.")] = None,
     damping: Annotated[float | None, typer.Option(help="Damping b of the device, N.s/m.")] = None,
     delay: Annotated[
         float | None, typer.Option(help="Delay from the sample of the position to the output of its force, s.")
     ] = None,
-    taps: Annotated[int | None, typer.Option("--N", min=1, help="Past samples of the rendering.")] = None,
+    taps: Annotated[int | None, typer.Option("--N", min=1, help="Past samples of the model.")] = None,
     period: Annotated[float | None, typer.Option("--T", help="Sampling time, s.")] = None,
     memory: Annotated[str | None, typer.Option(help='"short" (N samples) or "full".')] = None,
-    study: Annotated[Path | None, typer.Option("--study", help="Take what is not given from its [renderer].")] = None,
+    study: Annotated[Path | None, typer.Option("--study", help="Take omitted values from its [renderer].")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for figures and a page.")] = None,
     force: Force = False,
     as_json: Json = False,

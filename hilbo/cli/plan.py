@@ -21,20 +21,24 @@ def plan(
     out: Annotated[Path, typer.Option("--out", help="File for the plan.")] = Path("plan.json"),
     participants: Annotated[
         int | None,
-        typer.Option(min=1, help="How many people: P01, P02, ...; default: [plan] people, or all in the results."),
+        typer.Option(
+            min=1, help="Number of participants: P01, P02, ...; default: [plan] people, or all in the results."
+        ),
     ] = None,
-    names: Annotated[str | None, typer.Option(help="Their ids instead, separated by commas.")] = None,
+    names: Annotated[str | None, typer.Option(help="Ids of the participants instead, separated by commas.")] = None,
     kind: Annotated[str, typer.Option(help="optimisation, validation or aggregate-best.")] = "optimisation",
     results_: Annotated[
         list[str] | None, typer.Option("--from", help="result.json of the optimisation; MATERIAL=PATH for several.")
     ] = None,
-    trials: Annotated[Path | None, typer.Option(help="For a validation: the table or logs it was made from.")] = None,
-    material: Annotated[list[str] | None, typer.Option(help="Only this material; may be repeated.")] = None,
+    trials: Annotated[Path | None, typer.Option(help="For a validation: trial table or logs of the results.")] = None,
+    material: Annotated[list[str] | None, typer.Option(help="Use only this material. Repeatable.")] = None,
     source: Annotated[str, typer.Option(help="For a validation: aggregate or individual.")] = "aggregate",
     session: Annotated[str, typer.Option(help="Label of the session in tables and names of logs.")] = "",
-    reissue: Annotated[str | None, typer.Option(help="OLD=NEW: give NEW the row of OLD in the plan --out.")] = None,
+    reissue: Annotated[
+        str | None, typer.Option(help="OLD=NEW: reassign the plan slot of a drop-out (OLD) to a new participant (NEW).")
+    ] = None,
     register: Annotated[
-        Path | None, typer.Option("--register", help="Besides, one page for a pre-registration, in Markdown.")
+        Path | None, typer.Option("--register", help="Also write a page for preregistration, in Markdown.")
     ] = None,
     seed: Annotated[int, seed_option("of orders, and of every session")] = 0,
     force: ForceFile = False,
@@ -255,7 +259,7 @@ def _write_registration(file, plan, out: Path, force: bool) -> None:
     from hilbo.report.registration import registration
 
     write_new(out, registration(file, plan, __version__), force)
-    typer.echo(f"{out}: read it, and fill in what is to be written by you", err=True)
+    typer.echo(f"{out}: read it, and complete the items marked as to be written by you", err=True)
 
 
 def _write_plan(plan, out: Path, force: bool, as_json: bool) -> None:

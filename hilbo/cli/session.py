@@ -25,7 +25,7 @@ def export(
     out: Annotated[Path, typer.Option("--out", help="Folder for the tables.")],
     plan: Annotated[
         list[Path] | None,
-        typer.Option("--plan", help="Plan to compare with, which is put there too; may be repeated."),
+        typer.Option("--plan", help="Also export this plan, so that the report lists deviations from it. Repeatable."),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -54,14 +54,14 @@ def export(
             shutil.copyfile(path, folder / ("plan.json" if len(plans) == 1 else f"plan-{number}.json"))
         singles = netcdf(sessions, folder / "trials.nc", chosen)
         if not singles and log_tables.validation_table(sessions).empty:
-            raise InputError(f"{logs}: its sessions hold no answers that count yet; there is nothing to export.")
+            raise InputError(f"{logs}: its sessions have no responses that count yet; there is nothing to export.")
 
 
 @app_participants.command("add")
 def add(
     table: Annotated[Path, typer.Argument(help="The list, participants.csv.")],
     participant: Annotated[str, typer.Argument(help="Pseudonymous id.")],
-    consent_time: Annotated[str, typer.Option(help="When they agreed, ISO 8601.")],
+    consent_time: Annotated[str, typer.Option(help="Time of consent, ISO 8601.")],
     protocol_number: Annotated[str, typer.Option(help="Number of the ethics approval.")],
     age: Annotated[str, typer.Option(help="Years.")] = "",
     handedness: Annotated[str, typer.Option(help="right, left or both.")] = "",
@@ -77,7 +77,7 @@ def add(
 def delete(
     folder: Annotated[Path, typer.Argument(help="Folder with logs, tables and exports.")],
     participant: Annotated[str, typer.Argument(help="Pseudonymous id.")],
-    yes: Annotated[bool, typer.Option("--yes", help="Do it; without, nothing is touched.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Confirm the deletion; without it, nothing is changed.")] = False,
 ) -> None:
     """Delete all data of a participant who withdraws, below a folder, and list what was deleted and what needs manual
     action."""

@@ -35,14 +35,14 @@ def simulate(
     out: Out,
     preset: Preset = None,
     study: Annotated[Path | None, typer.Option("--study", help="Study file; by default the paper's.")] = None,
-    participants: Annotated[int | None, typer.Option(min=1, help="How many people; by default 24.")] = None,
+    participants: Annotated[int | None, typer.Option(min=1, help="Number of participants; by default 24.")] = None,
     seed: Annotated[
-        int, seed_option("of the people, of their answers and of the points among which optima are sought")
+        int, seed_option("of the participants, of their responses and of the candidate points of the optima")
     ] = 0,
     force: Force = False,
     as_json: Json = False,
     live: Annotated[
-        bool, typer.Option("--live", help="One person's session instead: real server, pages and simulated device.")
+        bool, typer.Option("--live", help="Run one live session instead: real server, pages and simulated device.")
     ] = False,
     kind: Annotated[
         str | None,
@@ -72,9 +72,7 @@ def _check_mode(live: bool, of_a_study: Mapping[str, Any], of_a_session: Mapping
     """Raise `InputError` for an option that would be ignored: with `live` one of a study, without it one of a session.
     Both map names of options to values; one without a value was not given."""
     if live and (given := [name for name, value in of_a_study.items() if value]):
-        raise InputError(
-            f"{given[0]} does nothing with --live, which holds one person's session in a new folder; leave it out."
-        )
+        raise InputError(f"{given[0]} does nothing with --live, which runs one session in a new folder; leave it out.")
     if not live and (given := [name for name, value in of_a_session.items() if value]):
         raise InputError(f"{given[0]} does nothing without --live; add --live, or leave it out.")
 

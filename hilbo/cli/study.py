@@ -22,8 +22,8 @@ def validate(
     responses: Annotated[Path, typer.Argument(help="Validation table (CSV or Parquet).", show_default=False)],
     study: StudyFile,
     out: Out,
-    sets: Annotated[Path | None, typer.Option(help="Sets table: what each set is, and where it is from.")] = None,
-    material: Annotated[str | None, typer.Option(help="Only this one of the table's materials.")] = None,
+    sets: Annotated[Path | None, typer.Option(help="Sets table: parameters and source of each set.")] = None,
+    material: Annotated[str | None, typer.Option(help="Use only this material of the table.")] = None,
     seed: Annotated[int, seed_option("of bootstrap resamples")] = 0,
     force: Force = False,
     as_json: Json = False,
@@ -45,14 +45,16 @@ def power(
     study: Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)],
     out: Out,
     preset: Preset = None,
-    rule: Annotated[str | None, typer.Option(help="Rule of aggregation in place of the study file's.")] = None,
-    material: Annotated[str | None, typer.Option(help="Which of the study's materials.")] = None,
-    participants: Annotated[str, typer.Option(help="How many people, separated by commas.")] = "6,12,24",
-    trials: Annotated[str, typer.Option(help="How many trials each, separated by commas.")] = "10,15,20,25",
+    rule: Annotated[str | None, typer.Option(help="Aggregation method in place of the study file's.")] = None,
+    material: Annotated[str | None, typer.Option(help="Material of the study.")] = None,
+    participants: Annotated[str, typer.Option(help="Numbers of participants, separated by commas.")] = "6,12,24",
+    trials: Annotated[
+        str, typer.Option(help="Numbers of trials per participant, separated by commas.")
+    ] = "10,15,20,25",
     error: Annotated[
-        float, typer.Option(min=0, max=1, help="Wanted of the optimum: NRMSE of the search ranges.")
+        float, typer.Option(min=0, max=1, help="Target error of the optimum (NRMSE, fraction of the ranges).")
     ] = 0.15,
-    studies: Annotated[int, typer.Option(min=2, help="How many studies to simulate.")] = 40,
+    studies: Annotated[int, typer.Option(min=2, help="Number of simulated studies.")] = 40,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; by default one for each core.")] = None,
     seed: Annotated[int, seed_option("of the simulated studies")] = 0,
     force: Force = False,
@@ -113,15 +115,13 @@ def report(
     folder: Annotated[Path, typer.Argument(help="Folder with study.toml and trials.csv.", show_default=False)],
     out: Out,
     exclude: Annotated[
-        str | None, typer.Option(help='Rule that leaves people out, instead of the study\'s: "trials < 10".')
+        str | None, typer.Option(help='Rule for excluding participants, instead of the study\'s: "trials < 10".')
     ] = None,
-    compare: Annotated[
-        bool, typer.Option(help="Compare all rules of aggregation, each person left out in turn.")
-    ] = True,
+    compare: Annotated[bool, typer.Option(help="Compare all aggregation methods by cross-validation.")] = True,
     people: Annotated[
         Path | None, typer.Option(help="participants.csv: the page describes ages and handedness; no row is copied.")
     ] = None,
-    seed: Annotated[int, seed_option("of bootstrap resamples, and of the points among which optima are sought")] = 0,
+    seed: Annotated[int, seed_option("of bootstrap resamples and of the candidate points of the optima")] = 0,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -130,7 +130,7 @@ def report(
     They go to the folder --out.
     """
     if out.resolve() in (folder.resolve(), *folder.resolve().parents):
-        raise InputError(f"{out}: holds the folder that is read; choose another --out.")
+        raise InputError(f"{out}: contains the folder that is read; choose another --out.")
     with results(out, force) as destination, progress() as say:
         start()
         say("reading")

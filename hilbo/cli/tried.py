@@ -32,8 +32,10 @@ def tried(
         typer.Argument(help="Study file of K1, B1 and alpha that a program presents; by default hilbo's own."),
     ] = None,
     trials: Annotated[int | None, typer.Option(min=15, max=25, help=f"How many blocks; {_TRIALS} by default.")] = None,
-    seed: Annotated[int | None, seed_option("of what is hidden and of the first blocks; else by chance")] = None,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the server; 0 takes any.")] = 0,
+    seed: Annotated[
+        int | None, seed_option("of the hidden reference and of the first blocks; random by default")
+    ] = None,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the server; 0 for any free one.")] = 0,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for study and log; by default a new one.")] = None,
     browse: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in this computer's browser.")] = True,
 ) -> None:
@@ -85,7 +87,7 @@ def study_text(source: Path | None, trials: int | None) -> str:
         text = (files("hilbo") / "data" / "try.toml").read_text(encoding="utf-8")
         return _LINE.sub(f"trials = {_TRIALS if trials is None else trials}", text)
     if trials is not None:
-        raise InputError(f"--trials: {source} says how many there are ([selection] trials); leave the option out.")
+        raise InputError(f"--trials: {source} specifies the number ([selection] trials); leave the option out.")
     from hilbo.app.server.tried import check_study
     from hilbo.study.file.reading import StudyFile
 

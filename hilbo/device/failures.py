@@ -80,8 +80,8 @@ def line_gone(line: str, error: OSError) -> str:
 def not_taken(line: str, error: Exception) -> str:
     """Sentence: the connection has ended because `error` was raised while received data were processed."""
     return (
-        f"{line}: what the device says cannot be taken ({error}); heartbeats have ended and the device stops by itself;"
-        " remove the cause, then connect again."
+        f"{line}: the output of the device cannot be processed ({error}); heartbeats have ended and the device stops by"
+        " itself; remove the cause, then connect again."
     )
 
 

@@ -49,10 +49,10 @@ def greet(link: Link, damping: SupportsFloat | None, delay: SupportsFloat | None
             f" set its watchdog_ticks to {_BEATS * BEAT:g} s at least."
         )
     if damping is not None and not 0.0 <= float(damping) < math.inf:  # NaN neither
-        raise InputError(f"The damping that the study counts on is {damping}; give a number from 0, in N.s/m.")
+        raise InputError(f"The damping that the study assumes is {damping}; give a number from 0, in N.s/m.")
     if damping is not None and _f32(float(damping)) > device.damping_N_s_per_m:
         raise InputError(
-            f"{link.name}: the study counts on {shortest(float(damping))} N.s/m of damping and the device has"
+            f"{link.name}: the study assumes {shortest(float(damping))} N.s/m of damping and the device has"
             f" {shortest(device.damping_N_s_per_m)}; plan the study with the device's damping."
         )
     if delay is not None:
@@ -67,11 +67,11 @@ def _check_delay(link: Link, delay: float) -> None:
     The device refuses sets that are not passive at its own delay, so a study that assumes less would propose such sets.
     """
     if not 0.0 <= delay < math.inf:
-        raise InputError(f"The delay that the study counts on is {delay}; give a number from 0, in s.")
+        raise InputError(f"The delay that the study assumes is {delay}; give a number from 0, in s.")
     own = link.request(GetLimits()).delay_us
     if own > round(delay * 1e6):
         raise InputError(
-            f"{link.name}: the study counts on a delay of at most {delay:g} s and the device checks its sets for"
+            f"{link.name}: the study assumes a delay of at most {delay:g} s and the device checks its sets for"
             f" {own * 1e-6:g} s; plan the study with [renderer] delay = {own * 1e-6:g}."
         )
 

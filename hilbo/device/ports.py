@@ -130,7 +130,9 @@ def _connected(where: str) -> SocketPort:
     try:
         connected = socket.create_connection((host, int(number)), timeout=3)
     except (OSError, OverflowError) as error:
-        raise InputError(f"{where}: nobody answers ({error}); check address and port, and that it listens.") from error
+        raise InputError(
+            f"{where}: no server answers ({error}); check address and port, and that it listens."
+        ) from error
     with contextlib.suppress(OSError):
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return SocketPort(connected, where)

@@ -139,14 +139,14 @@ ABOUT_INPUT = frozenset(NackReason(n) for n in range(9, 21)) | {NackReason.LINE_
 """Refusals caused by the numbers sent, which the sender can correct."""
 
 _HOLD = {
-    HoldReason.NONE: "it was asked to",
+    HoldReason.NONE: "it received a stop",
     HoldReason.WATCHDOG: "no fresh heartbeat came from the host",
     HoldReason.INPUT: "too many positions were bad, or none changed while it pushed; check the encoder",
     HoldReason.VELOCITY: "it moved faster than its velocity limit",
     HoldReason.OVERRUN: "a tick was missed, or its force came out later than the device's delay",
     HoldReason.MODEL: "the model's force was not finite",
     HoldReason.ENERGY: "the passivity observer stopped it",
-    HoldReason.ESTOP: "the emergency stop was asked for",
+    HoldReason.ESTOP: "the emergency stop was pressed",
     HoldReason.BOOT: "it has just started",
     HoldReason.SWITCH: "the hardware stop is open",
     HoldReason.HEAT: "the mean force was above what the motor bears continuously",
@@ -180,10 +180,10 @@ _NACK = {
     NackReason.STATES: "The exponentials of full memory are out of range or order; use those of"
     " hilbo.mechanics.exponentials.",
     NackReason.NOTHING_STAGED: "The device has no set staged; send one first.",
-    NackReason.SET_MISMATCH: "The device holds another set than the one named; send it again.",
+    NackReason.SET_MISMATCH: "The device has another set than the one named; send it again.",
     NackReason.NOT_READY: "The staged set's history needs {ticks} more ticks, or no contact; wait, or let go.",
-    NackReason.BUSY: "The device needs {ticks} more ticks for what it was asked before; wait.",
-    NackReason.NO_SET: "The device has no set in force; send one first.",
+    NackReason.BUSY: "The device needs {ticks} more ticks for the previous request; wait.",
+    NackReason.NO_SET: "The device has no active set; send one first.",
     NackReason.NO_HEARTBEAT: "The device hears no fresh heartbeat; check the line in both directions.",
     NackReason.LINE_TOO_SLOW: "The line is too slow for this telemetry; every {limit:g}th tick is the most it carries.",
     NackReason.NOT_CAPABLE: "The device cannot do {request}.",

@@ -65,7 +65,7 @@ def _confirmed(link: Link, messages: Sequence[SetParams | SetStates]) -> InForce
     wrong, reported = differences(messages, reply), in_force(reply)
     if wrong or reported is None:
         raise DeviceError(
-            f"{link.name}: the device has another set in force than was sent ({', '.join(wrong)}); do not use it, send"
-            " the set again."
+            f"{link.name}: the active set of the device is not the one that was sent ({', '.join(wrong)}); do not use"
+            " it, send the set again."
         )
     return reported

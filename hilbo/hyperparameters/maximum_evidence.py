@@ -223,7 +223,7 @@ def _checked(learn: Sequence[str], inference: str) -> tuple[str, ...]:
     unknown = [name for name in learn if name not in get_args(Learnable)]
     if unknown or not learn:
         asked = f'"{unknown[0]}"' if unknown else "nothing"
-        raise InputError(f"hyperparameters: asked to learn {asked}; choose from {', '.join(get_args(Learnable))}.")
+        raise InputError(f"hyperparameters: cannot learn {asked}; choose from {', '.join(get_args(Learnable))}.")
     if {"variance", "noise", "thresholds"} <= set(learn):
         raise InputError(
             "hyperparameters: variance, noise and thresholds cannot all be learnt, because the scale of the latent"

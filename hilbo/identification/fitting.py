@@ -56,7 +56,7 @@ class Test(eqx.Module):
         if not np.all(np.diff(self.time) > 0):
             raise InputError(f"The times of the {self.kind} test do not increase from row to row; sort its rows.")
         if (self.input is None) == (self.kind in MEASURED):
-            needs = "needs the recorded input beside the output" if self.input is None else "has no input"
+            needs = "needs the recorded input in addition to the output" if self.input is None else "has no input"
             raise InputError(f"A {self.kind} test {needs}.")
         recorded = (self.time, self.output) if self.input is None else (self.time, self.output, self.input)
         if not all(np.all(np.isfinite(values)) for values in recorded):

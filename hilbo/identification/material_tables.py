@@ -86,7 +86,7 @@ def read_material(
     )
     kinds = _kinds(text, columns, source)
     if only is not None and only not in set(kinds):
-        raise InputError(f'{source}: holds no test "{only}"; it has {", ".join(kinds.unique())}.')
+        raise InputError(f'{source}: contains no test "{only}"; it has {", ".join(kinds.unique())}.')
     repeats = text["repeat"].str.strip() if "repeat" in text else pd.Series("", text.index)
     notes: list[str] = []
     tests = [

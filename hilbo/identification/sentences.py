@@ -104,7 +104,7 @@ def _coarse(best_fit: Fit, sampling: Spread, tests: Sequence[Test]) -> Iterator[
     names = [n for n, m, e in zip(best_fit.model.labels, moved, errors, strict=True) if m > _SHARE_OF_ERROR * e]
     so = f"; a curve in place of it moves {' and '.join(names)} by more than half a standard error" if names else ""
     yield (
-        f"The samples of the {' and '.join(coarse)} test are further apart than T = {1000 * best_fit.model.T:g} ms;"
+        f"The samples of the {' and '.join(coarse)} test are more than T = {1000 * best_fit.model.T:g} ms apart;"
         f" the input was interpolated linearly in between{so}, which the intervals do not contain: record a row every"
         f" {1000 * best_fit.model.T:g} ms while the input changes."
     )

@@ -188,7 +188,7 @@ def rule_map(
     if rule not in GIVEN:
         raise InputError(f'rule_map: the rule is "{rule}"; it must be one of {", ".join(GIVEN)}.')
     if not np.asarray(trials.mask).any():
-        raise InputError("rule_map: nobody gave an answer; at least one person's answers are needed.")
+        raise InputError("rule_map: there are no responses; at least one participant's are needed.")
     prior = jnp.asarray(gp.kernel.variance)
     one = to_device(1.0, prior.dtype)
     if RULES[rule].learns_share:
@@ -221,8 +221,8 @@ def share_of(gp: OrdinalGP, trials: Trials, inference: str = "laplace", largest:
     answered = np.flatnonzero(np.asarray(trials.mask).any(axis=1))
     if len(answered) < 2:
         raise InputError(
-            'The rule "hierarchical" learns how people differ, and only'
-            f' {len(answered)} of them gave an answer; use "bcm", whose map is then that person\'s.'
+            'The rule "hierarchical" estimates individual differences, and responses are from'
+            f' {len(answered)} participant; use "bcm", whose map is then the individual map.'
         )
     few = rows_of(trials, answered[even_rows(rows_of(trials, answered), largest)])
     return learn_share(gp, few, "ep" if inference == "exact" else inference)

@@ -23,6 +23,6 @@ def formula(kernel: Stationary) -> str:
     """
     thetas = np.ravel(np.asarray(kernel.theta))
     given = ", ".join(f"{theta:.4g}" for theta in thetas)
-    levels = ", where two different levels of a parameter count as 1 apart" if any(kernel.levels) else ""
+    levels = ", where two different levels of a parameter have the distance 1" if any(kernel.levels) else ""
     each = "every θᵢ" if kernel.theta.ndim == 0 else "θ"
     return f"k(x, x′) = {float(kernel.variance):.4g} · {_FORMS[type(kernel)]}, with {each} = {given}{levels}"

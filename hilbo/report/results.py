@@ -206,7 +206,7 @@ def _not_converged(people: People) -> list[str]:
     shown = names if len(names) <= 10 else [*names[:10], f"{len(names) - 10:,} others"]
     return [
         f"The {'fit' if one else 'fits'} of {', '.join(shown)} did not reach {'its' if one else 'their'} tolerance, so"
-        " that the results may be off by more than rounding; see the certificates in result.json."
+        " that the results may be off by more than rounding; see the certificate of each fit in result.json."
     ]
 
 
@@ -277,10 +277,10 @@ def write_results(
     study, aggregate = population.study, population.aggregate
     people = people_of(study, aggregate)
     content = cohort_content(population, truth, people, left_out)
-    say("the population map on a grid")
+    say("computing the population map on a grid")
     grid = population_grid(population) if grid is None else grid
     write_numbers(content, people, grid, folder)
-    say("figures and report")
+    say("drawing figures and writing the report")
     figures, shown = _figures(population, truth, grid)
     pictures = save_figures(figures, folder) | (pictures or {})
     how = how_aggregated(aggregate.map)

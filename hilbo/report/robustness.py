@@ -212,8 +212,8 @@ def _warnings(check):
     alike, sentences = _correlation(both.optimised), []
     if alike < _UNRELATED:
         sentences.append(
-            f"Under the optimised hyperparameters renderings a tenth of a search range apart have a correlation of"
-            f" {alike:.2g}: the answers do not make a smooth map, and an optimum found with it says little."
+            f"Under the optimised hyperparameters two stimuli at a distance of a tenth of a search range have a"
+            f" correlation of {alike:.2g}: the map is not smooth, and its optimum is unreliable."
         )
     chances = np.asarray(check.optimised.optimum.class_probabilities)
     goal = both.optimised.goal.category

@@ -143,7 +143,7 @@ class SearchSpace(eqx.Module):
         shape = np.shape(points)
         if not shape or shape[-1] != self.dim:
             raise InputError(
-                f"SearchSpace: points have the shape {shape}; the last axis must hold {self.dim} numbers, of"
+                f"SearchSpace: points have the shape {shape}; the last axis must have {self.dim} numbers, of"
                 f" {', '.join(self.names)}."
             )
 

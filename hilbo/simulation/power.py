@@ -104,8 +104,8 @@ def _check_rule(rule: str, plan: Plan) -> None:
     """Raise InputError for numbers of participants or responses that the rule cannot aggregate."""
     if min(plan.participants) < RULES[rule].least_people:
         raise InputError(
-            f'power: the rule "{rule}" learns how people differ and needs two of them; ask for 2 participants or'
-            " more, or use another rule."
+            f'power: the rule "{rule}" estimates individual differences and needs two participants; give 2'
+            " participants or more, or use another rule."
         )
     answers = max(plan.participants) * max(plan.trials)
     if RULES[rule].exact_only and answers > LARGEST_EXACT:

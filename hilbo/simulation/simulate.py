@@ -136,7 +136,7 @@ def people(study: Study, population: Population, count: int, seed: int) -> Perso
     if len(optima) < count:
         raise InputError(
             f"simulate: of {64 * _MOST_DRAWS:,} people drawn around the truth only {len(optima)} like a rendering of"
-            " this study; move the truth of [simulation] into what may be rendered, or make its spread smaller."
+            " this study; move the truth of [simulation] into the feasible region, or reduce its spread."
         )
     factor = np.exp(population.tolerance_sd * rng.standard_normal((count, 1)))
     return Person(

@@ -128,7 +128,7 @@ def _sets_compared(left: np.ndarray, right: np.ndarray, chosen: np.ndarray) -> l
         )
     sets = sorted({*left, *right})
     if "tie" in sets:
-        raise InputError('a set called "tie" cannot be told from a tie; give it another name.')
+        raise InputError('a set called "tie" cannot be distinguished from a tie; give it another name.')
     return sets
 
 
@@ -137,5 +137,5 @@ def _shown_first(order: Sequence | np.ndarray | None, count: int) -> np.ndarray:
     wrong length."""
     shown_first = np.zeros(count) if order is None else np.asarray(order)
     if shown_first.shape != (count,) or pd.isna(shown_first).any() or not np.isin(shown_first, (-1, 0, 1)).all():
-        raise InputError("order must hold 1, -1 or 0 for each comparison: first was shown first, second, or unknown.")
+        raise InputError("order must be 1, -1 or 0 for each comparison: first was shown first, second, or unknown.")
     return shown_first

@@ -124,7 +124,7 @@ def _table_4(table: pd.DataFrame, sources: Mapping[str, str], roles: Mapping[str
     InputError without such comparisons."""
     rows = aggregate_comparisons(table, sources, roles)
     if rows.empty:
-        raise InputError("no comparison of an aggregate's set with an individual's holds a preference.")
+        raise InputError("no comparison of an aggregate's set with an individual's has a preference.")
     clusters, preferred = rows[["participant", "set"]], rows["preferred"].to_numpy()
     if (preferred != TIE).all():
         return binary_logit(preferred == _OURS, None, clusters, intercept=_OURS, level=level)

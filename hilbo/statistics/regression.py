@@ -145,7 +145,7 @@ def _check_independent(model: Design, names: list[str], nuisance: int) -> None:
     if not good.all():
         name = names[order[np.argmin(good)]]
         raise InputError(
-            f'"{name}" is a combination of the other coefficients (a constant or a double, say); leave it out.'
+            f'"{name}" is a combination of the other coefficients (such as a constant or a duplicate); leave it out.'
         )
 
 

@@ -67,7 +67,7 @@ class Cohort(eqx.Module):
         """Copy of the cohort in which only each participant's first `count` responses are unmasked; capacity and
         `physical` are unchanged. Raises `InputError` for fewer than one."""
         if count < 1:
-            raise InputError(f"Cohort: asked for everybody's first {count} trials; give a number from 1.")
+            raise InputError(f"Cohort: first is {count}; give a number of trials from 1.")
         mask = np.asarray(self.trials.mask) & (np.arange(self.trials.mask.shape[1]) < count)[None, :]
         return dataclasses.replace(self, trials=eqx.tree_at(lambda t: t.mask, self.trials, to_device(mask)))
 

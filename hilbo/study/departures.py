@@ -31,7 +31,7 @@ def departures(
     for phase in dict.fromkeys(plan.phase for plan in plans):
         those = [plan for plan in plans if plan.phase == phase]
         if held is None and phase != PHASE:
-            what = "and nothing says whose sessions followed it: a table of sessions, as of hilbo export, is missing"
+            what = "and the sessions that followed it are unknown: a table of sessions, as of hilbo export, is missing"
             deviations += [f"The plan {plan.hash} is of {phase}, {what}." for plan in those]
             continue
         here = None if held is None else [session for session in held if phase in session.phases.split(", ")]
@@ -100,7 +100,7 @@ def _of_optimisations(
     known = {session.participant for session in held or ()}
     unknown = [name for name in counts if name not in known]
     if held is not None and unknown:
-        sentences.append(f"The table of sessions does not say by which plan these were held: {', '.join(unknown)}.")
+        sentences.append(f"The table of sessions lacks the plan of these: {', '.join(unknown)}.")
     return sentences
 
 

@@ -91,7 +91,7 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     trials = _table_paths(folder, "trials")
     if not trials:
         raise InputError(
-            f"{folder}: holds no trials.csv (nor .parquet, nor trials-*.csv, nor an export's data/); put the trial"
+            f"{folder}: contains no trials.csv (nor .parquet, nor trials-*.csv, nor an export's data/); put the trial"
             " table there."
         )
     validation = [_validation(path, study) for path in _table_paths(folder, "validation")]
@@ -328,9 +328,7 @@ def _missing_tables(
     if study.file.materials and materials[0].name == "":
         sentences.append("The tables name no material; they are read by the study's own, and none of [materials].")
     if compared is None:
-        sentences.append(
-            "There is no validation table: nothing here says whether people agree with the map when asked again."
-        )
+        sentences.append("There is no validation table: the map is not validated.")
     for material in materials:
         if compared is not None and material.validation is None:
             sentences.append(f"No validation session compared renderings of {material.name}.")

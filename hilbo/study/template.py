@@ -80,6 +80,7 @@ def study_text(new: NewStudy) -> str:
         constraints=constraints,
         responses=", ".join(map(toml_string, new.responses)),
         definitions=[(name, _DEFINITIONS[name]) for name in new.responses if name in _DEFINITIONS],
+        attribute=_attribute(new),
         recommended=RECOMMENDED,
         default=DEFAULT,
         thresholds=[k - (len(new.responses) - 2) / 2 for k in range(len(new.responses) - 1)],
@@ -87,7 +88,9 @@ def study_text(new: NewStudy) -> str:
     try:
         file = tomllib.loads(text)
     except UNREADABLE as error:
-        raise InputError(f"a name or an answer has what no file can hold ({error}); leave it out.") from error
+        raise InputError(
+            f"a name or a response has characters that a file cannot contain ({error}); leave them out."
+        ) from error
     try:
         checked(file, "", _build if constraints else _accept)
     except InputError as error:
@@ -145,6 +148,13 @@ def _parameters(new: NewStudy) -> Sequence[Parameter]:
     if twice is not None:
         raise InputError(f"--parameter: {twice} is given twice; give each name once.")
     return new.parameters
+
+
+def _attribute(new: NewStudy) -> str:
+    """The judged attribute: that of the paper for its device, similarity for the default responses, else a rating."""
+    if new.device:
+        return "perceived realism"
+    return "similarity to the reference" if new.responses == NewStudy._field_defaults["responses"] else "rating"
 
 
 def _tolerances(parameters: Sequence[Parameter], part: int) -> str:

@@ -128,10 +128,10 @@ def test_the_reason_of_a_hold_is_on_the_experimenter_s_page(tmp_path):
         view = live.until(lambda v: v["phase"] == "trouble" and v["device"]["state"] == "hold", live.whole)
         assert ["Reason", words] in view["device"]["rows"]
         assert view["phase_words"] == f"Stopped: The device is in HOLD: {words}."
-        live.until(lambda v: f"The device holds: {words}. W1 is void." in str(v["log"]), live.whole)
-        live.fake.notices.append("tick 7: STOPPED, it was asked to")
+        live.until(lambda v: f"The device is in hold: {words}. W1 is void." in str(v["log"]), live.whole)
+        live.fake.notices.append("tick 7: STOPPED, it received a stop")
         view = live.until(lambda v: v["log"][0][0] == "", live.whole)
-        assert view["log"][0][2] == "The device, tick 7: STOPPED, it was asked to."
+        assert view["log"][0][2] == "The device, tick 7: STOPPED, it received a stop."
         seqs = [seq for seq, _, _ in blind.experimenter(live.hub, view)["log"]]
         assert seqs and all(seqs)
 

@@ -51,7 +51,7 @@ def test_words_of_what_is_done(driver):
     state, at = driver.state, 50.0
     words = [sentence(state, event) for event in driver.events]
     assert words[0] == "W1 comes next: A, as planned."
-    assert "W1: rendering A is presented." in words and "W1 is answered: similar." in words
+    assert "W1: stimulus A is presented." in words and "W1 is answered: similar." in words
     assert words[-2:] == ["The next part begins.", "O1 comes next."]
     steps = live.present(state, 3, 0, True, at)
     assert said(driver, steps) == "O1: the reference is presented."
@@ -59,11 +59,11 @@ def test_words_of_what_is_done(driver):
     answer = live.answer(driver.state, 3, "c", {"class_a": "close"}, at, browser={"response_s": 1.25}, felt=False)
     assert said(driver, answer) == "O1 is answered after 1.2 s: close."
     again = live.repeat(driver.state, at, 3)
-    assert said(driver, again) == "O1 will be asked once more, later."
+    assert said(driver, again) == "O1 will be repeated later."
     assert said(driver, live.void(driver.state, 3, "a cough.", at)) == "O1 is made void: a cough."
     assert said(driver, live.restore(driver.state, 3, at)) == "The answer to O1 counts again."
     assert said(driver, live.undo(driver.state, at)) == "The answer to O1 is taken back."
-    assert said(driver, live.pause(driver.state, "participant", at)) == "A break, asked for by the participant."
+    assert said(driver, live.pause(driver.state, "participant", at)) == "A break, requested by the participant."
     assert said(driver, live.note(driver.state, "yawned", at)) == "Note: yawned"
     assert said(driver, live.abort(driver.state, "", at)) == "The session is ended early."
 
@@ -81,7 +81,7 @@ def test_words_of_a_device_that_holds(driver):
     driver.log(live.present(driver.state, 3, 0, True, 50.0))
     held = live.device(driver.state, "hold", 51.0, trial=3, reason="the force was too large")
     who = "The program that presents"  # this study has no renderer
-    assert said(driver, held) == f"{who} holds: the force was too large. O1 is void."
+    assert said(driver, held) == f"{who} is in hold: the force was too large. O1 is void."
     lost = live.device(driver.state, "lost", 52.0, reason="the line is gone.")
     assert said(driver, lost) == f"{who} is lost: the line is gone."
     assert said(driver, live.device(driver.state, "ready", 53.0)) == f"{who} is ready."

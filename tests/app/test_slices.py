@@ -42,7 +42,7 @@ def test_one_parameter_has_one_slice_with_the_answers_up():  # compiles a step o
     mean = np.array(only["mean"])
     assert mean.shape == (33, 33) and (mean == mean[0]).all()
     assert abs(only["best"][0] - mean[0].argmax() / 32) < 1 / 32 and only["best"][1] == 1.0
-    assert dict(maps.trust(state))["Best so far"].startswith("gain ")
+    assert dict(maps.trust(state))["Current optimum"].startswith("gain ")
 
 
 class NoMaps:

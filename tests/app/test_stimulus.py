@@ -132,7 +132,7 @@ def test_a_value_that_is_too_far_off_voids_the_trial(live):
     program = live.by_hand()
     live.begin()
     order = program.asked(live)
-    with refused(409, "it may be off by 0.5 deg"):
+    with refused(409, "the tolerance is 0.5 deg"):
         program.report("presented", values=order["values"] | {"hue": order["values"]["hue"] + 0.51})
     voided(live, "stimulus: off: hue is confirmed as")
 
@@ -172,7 +172,7 @@ def test_what_is_not_understood_or_not_of_the_order_changes_nothing(live):
     for body in bodies:
         with refused(400, "not understood"):
             raw(program, body)
-    with refused(409, "say hello first"):
+    with refused(409, "send hello first"):
         program.post("/api/stimulus", {"run": "another", "order": 1, "state": "neutral"})
     assert not live.events("sent") and not live.events("missed")
     program.report(**good)
@@ -237,7 +237,7 @@ def test_a_silent_program_is_lost_and_comes_back_by_hello(tmp_path):
         live.until(lambda view: view["step"])
         live.until(lambda v: v["device"]["state"] == "lost", live.whole)
         voided(live, "device: lost (by hand has been silent for 0.6 s.)", "trouble")
-        with refused(409, "say hello first"):
+        with refused(409, "send hello first"):
             program.report("presented", order=order["order"])
         program.hello()
         program.report("neutral")
@@ -256,7 +256,7 @@ def test_a_program_with_the_key_of_one_that_is_heard_waits_until_that_is_silent(
         live.until(lambda v: v["device"]["state"] == "lost", live.whole)
         second.hello()
         second.report("neutral")
-        with refused(409, "say hello first"):
+        with refused(409, "send hello first"):
             first.report("neutral")
         live.device_did("stopped", "ready", "lost", "ready")
 
@@ -291,7 +291,7 @@ def test_a_program_that_does_not_go_neutral_when_told_is_lost(tmp_path):
         program.report("presented")
         live.until(lambda v: v["device"]["state"] == "running", live.whole)
         live.command("pause")
-        live.until(lambda v: "has not said that it is neutral" in v["device"]["words"], live.whole)
+        live.until(lambda v: "has not confirmed neutral" in v["device"]["words"], live.whole)
         with refused(409, "say hello"):
             program.report("presented", order=order["order"])
 
@@ -330,7 +330,7 @@ def test_a_stop_while_a_confirmation_is_waited_for_ends_the_wait(tmp_path):
 
 def test_a_stop_that_nobody_acknowledges_is_said(live):
     live.by_hand(force=True, neutral_within_s=0.01)
-    with refused(409, "use the switch beside the hand"):
+    with refused(409, "use the hardware switch"):
         live.command("estop")
     live.until(lambda v: v["device"]["state"] == "lost", live.whole)
 
@@ -465,7 +465,7 @@ def test_the_doctor_measures_renderings_and_stops(tmp_path):
 
 def test_the_doctor_says_what_a_program_does_not_do(tmp_path):
     (check,) = checked(tmp_path, lambda link: Presenter(link, off=5.0))
-    assert check.level == "bad" and "it may be off by" in check.words
+    assert check.level == "bad" and "the tolerance is" in check.words
     (check,) = doctor.stimulus_checks(tmp_path / "study.toml", 0, 0.2)
     assert check.level == "bad" and "No program that presents has joined yet" in check.words
 

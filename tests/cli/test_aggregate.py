@@ -50,7 +50,7 @@ def test_a_table_of_one_material_is_read_as_that_material(read):
 
 
 def test_a_table_of_two_materials_or_of_an_unknown_one_is_refused(read):
-    with pytest.raises(InputError, match=r"holds 2 materials \(gel, foam\); choose one with --material"):
+    with pytest.raises(InputError, match=r"contains 2 materials \(gel, foam\); choose one with --material"):
         read("participant,trial,response,u,material\nA,1,yes,1,gel\nA,1,no,1,foam\n")
     with pytest.raises(InputError, match=r"materials\.silk is not in the study, its materials: gel, foam"):
         read("participant,trial,response,u,material\nA,1,yes,1,silk\n")

@@ -102,7 +102,7 @@ def test_monitor_tells_that_the_hardware_stop_is_open(device, monkeypatch):
 
 def test_home(device):
     code, stdout, _ = device("home", "--position", 0, *FAST, *NEW)
-    assert (code, stdout) == (0, "homed: the handle stands at 0 mm\n")
+    assert (code, stdout) == (0, "homed: the handle is at 0 mm\n")
     assert device("home", *FAST, *NEW)[0] == 2
     code, _, stderr = device("home", "--position", 30, *FAST, *NEW)
     assert code == 2 and "HOME asks for 30, beyond the device's limit of 20.1" in stderr

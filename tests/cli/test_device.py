@@ -82,12 +82,12 @@ def test_set(device, sets):
         (["set", *A, "--N", "100"], 2, "N is even"),
         (["set", *A, "--T", "0.002"], 2, "a set belongs to its T"),
         (["set", *A, "--memory", "long"], 2, 'memory is "long"'),
-        (["set", *A, "--damping", "2"], 2, "counts on 2 N.s/m of damping and the device has 0.95"),
+        (["set", *A, "--damping", "2"], 2, "assumes 2 N.s/m of damping and the device has 0.95"),
         (["set", *A, "--device", "/dev/hilbo-nothing"], 2, "there is no such port"),
-        (["set", "--sets", "sets.csv"], 2, "holds the sets S, A, V; choose one with --name"),
-        (["set", "--sets", "sets.csv", "--name", "X"], 2, 'holds no set "X"'),
+        (["set", "--sets", "sets.csv"], 2, "contains the sets S, A, V; choose one with --name"),
+        (["set", "--sets", "sets.csv", "--name", "X"], 2, 'contains no set "X"'),
         (["set", "--sets", "none.csv"], 2, "none.csv: cannot be read"),
-        (["start"], 1, "The device has no set in force; send one first."),
+        (["start"], 1, "The device has no active set; send one first."),
         (["stop"], 2, "--device is missing"),
         (["estop", "--device", "sim"], 2, "would stop a new simulated device, and nothing that moves"),
         (["hello", "--sim", "finger"], 2, "write KEY=VALUE"),
@@ -120,7 +120,7 @@ def test_bad_input_is_one_sentence(device, tmp_path, monkeypatch, arguments, cod
         ("set_id,K1,B1,alpha\n", "has no rows"),
         ("set_id,K1,B1,alpha\nA,1,2,x\n", 'sets.csv:2: alpha is "x"; it must be a finite number'),
         ("set_id,K1,B1,alpha,N\nA,1,2,0.5,1.5\n", "N is"),
-        ("set_id,K1,B1,alpha\nA,1,2,0.5\nA,1,2,0.5\n", "stands there already"),
+        ("set_id,K1,B1,alpha\nA,1,2,0.5\nA,1,2,0.5\n", "is there already"),
         ("set_id,K1,B1,alpha\nA,1,2\n", "has 3 cells, the header has 4"),
         ("set_id,K1,B1,alpha\nA,1,2,\n", 'alpha is ""'),
     ],
@@ -328,7 +328,7 @@ def test_keys_from_a_terminal(device, sets):
 
     thread = threading.Thread(target=listen, daemon=True)
     thread.start()
-    for key, words in ((b"1", b"is in force"), (b" ", b"RUNNING")):
+    for key, words in ((b"1", b"is active"), (b" ", b"RUNNING")):
         _type_until(master, key, words, said)
     os.write(master, b"q")
     assert feels.wait(60) == 0

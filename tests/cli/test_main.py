@@ -57,7 +57,7 @@ def test_aggregate_writes_everything(capsys, monkeypatch, tmp_path):
     assert "http://" not in page and "https://" not in page
     assert len(pd.read_csv(out / "optima.csv")) == 8
     assert content["rule"] == "bcm" and 0 < content["heterogeneity"]["share"] < 1
-    assert any(words.startswith("People differ") for words in content["warnings"])
+    assert any(words.startswith("Participants differ") for words in content["warnings"])
     assert content["other_inference"]["inference"] == "ep" and 0 <= content["other_inference"]["nrmse"] < 0.5
     assert "With expectation propagation instead, the optimum would move by" in page
     before = (out / "result.json").read_bytes()
@@ -207,7 +207,7 @@ def test_no_optima_of_people_are_sought_if_they_are_not_wanted(capsys, monkeypat
     assert all(p["optimum"] is None and p["certificate"]["converged"] for p in content["participants"])
     assert content["mean_of_optima"] is None and content["alternatives"] == {}
     page = " ".join((out / "report.html").read_text().split())
-    assert "Their own optima were not sought" in page and page.count("data:image/png;base64,") == 1
+    assert "Individual optima were not computed" in page and page.count("data:image/png;base64,") == 1
     assert "Alternative estimates" not in page
     assert len(pd.read_csv(out / "optima.csv")) == 1
     small = json.loads(run(capsys, monkeypatch, "aggregate", *VIDEO, "--out", tmp_path / "small", *few)[1])
@@ -236,4 +236,4 @@ def test_every_option_says_what_it_does():
 
 def test_help_shows_the_names_of_tables(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    assert "study states in [simulation]" in run(capsys, monkeypatch, "power", "--help")[1]
+    assert "[simulation]" in run(capsys, monkeypatch, "power", "--help")[1]

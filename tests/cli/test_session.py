@@ -184,10 +184,10 @@ def no_number(value):
         (no_number(1e308), "u of the optimum is 1e+308; it must be from 0 to 1"),
         (no_number(-3), "u of the optimum is -3; it must be from 0 to 1"),
         (no_number("x"), "u of the optimum is x; it must be a number from 0 to 1"),
-        ({"participants": [{"participant": "P01", "optimum": None}]}, "hold no individuals' optima"),
+        ({"participants": [{"participant": "P01", "optimum": None}]}, "have no individual optima"),
         ({"participants": [{"participant": "P01", "optimum": {"parameters": {"u": 9, "v": 0}}}]}, "optimum of P01"),
         ({"participants": [{"participant": "P01", "optimum": 7}]}, "is no result.json"),
-        ({"participants": []}, "holds no participants"),
+        ({"participants": []}, "contains no participants"),
         ({"participants": [{"participant": "../P01"}]}, 'participant is "../P01"'),
         ({"seed": "x"}, "is no result.json"),
     ],
@@ -282,7 +282,7 @@ def test_a_folder_of_comparisons_alone_is_exported(hilbo, tmp_path):
     assert not (tmp_path / "tables" / "trials.nc").exists()
     validation_log(tmp_path / "begun", study, answered=False)
     code, _, err = hilbo("export", "begun", "--study", "study.toml", "--out", "none")
-    assert code == 2 and "no answers that count" in err and not (tmp_path / "none").exists()
+    assert code == 2 and "no responses that count" in err and not (tmp_path / "none").exists()
 
 
 def test_a_report_reads_the_folder_of_an_export(hilbo, tmp_path):

@@ -181,7 +181,7 @@ def test_a_program_whose_neutral_fails_is_lost_and_does_not_say_that_it_is(tmp_p
         client = module("hilbo_stimulus")
         said = {"force": True, "go_neutral": broken, "neutral_within_s": 0.01}
         with client.Stimulus(live.link(), "arm", "1", **said):
-            live.until(lambda v: "has not said that it is neutral" in v["device"]["words"], live.whole)
+            live.until(lambda v: "has not confirmed neutral" in v["device"]["words"], live.whole)
             assert all(event.data["condition"] != "ready" for event in live.events("device"))
 
 

@@ -200,7 +200,7 @@ def test_a_device_that_is_not_ready_is_not_pushed(recorded, fault, options, word
 def test_an_emergency_stop_is_cleared_by_a_person_first():
     with Renderer.open("sim", options=NEW) as device:
         device.estop()
-        with pytest.raises(DeviceError, match="the device is ESTOP: the emergency stop was asked for"):
+        with pytest.raises(DeviceError, match="the device is ESTOP: the emergency stop was pressed"):
             commission(device, Nobody(device), quiet)
 
 

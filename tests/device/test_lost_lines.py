@@ -67,7 +67,7 @@ def test_a_capture_that_fails_ends_the_heartbeats(capsys):
     with peer.open(**PATIENT, capture=capture) as device:
         until(lambda: peer.heartbeats > 2)
         full.set()
-        with pytest.raises(DeviceError, match=r"cannot be taken.*No space left"):
+        with pytest.raises(DeviceError, match=r"cannot be processed.*No space left"):
             device.state()
         assert silent(peer)
         with pytest.raises(DeviceError, match="ESTOP was written"):

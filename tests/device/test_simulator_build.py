@@ -30,7 +30,7 @@ def test_without_pseudo_terminals_there_is_one_sentence(monkeypatch):
 def test_a_cache_that_cannot_be_written_is_one_sentence(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    with pytest.raises(DeviceError, match="set XDG_CACHE_HOME to a folder of yours"):
+    with pytest.raises(DeviceError, match="set XDG_CACHE_HOME to another folder"):
         simulator.built()
 
 

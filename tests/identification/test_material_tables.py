@@ -89,7 +89,7 @@ def test_moduli_are_interpolated_in_their_logarithms(tmp_path, head, slope):
 def test_a_part_of_a_table(tmp_path):
     (test,), _, _ = read_material(table(tmp_path), longest=0.08)
     assert test.time[-1] == 0.08
-    with pytest.raises(InputError, match='holds no test "creep"'):
+    with pytest.raises(InputError, match='contains no test "creep"'):
         read_material(table(tmp_path), only="creep")
     with pytest.raises(InputError, match="the relaxation test has no row up to -1 s; give a --longest above 0 s"):
         read_material(table(tmp_path), longest=-1.0)

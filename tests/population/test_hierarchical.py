@@ -113,5 +113,5 @@ def test_the_curve_is_the_evidence_between_its_nodes():
 
 
 def test_nobody_answered():
-    with pytest.raises(InputError, match="nobody gave an answer"):
+    with pytest.raises(InputError, match="there are no responses"):
         of_people(jax.tree.map(lambda leaf: np.asarray(leaf)[None], Trials.empty(8, 2)))

@@ -154,7 +154,7 @@ def test_before_the_answers_stand_the_medians_and_what_is_stated():
 
 def test_nobody_answered():
     trials = answers()
-    with pytest.raises(InputError, match="learnt-1: nobody gave an answer"):
+    with pytest.raises(InputError, match="learnt-1: there are no responses"):
         learn(jax.tree.map(lambda leaf: leaf, Trials(trials.x[0], trials.q[0], trials.mask[0] & False)), 3)
 
 

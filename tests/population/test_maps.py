@@ -55,11 +55,11 @@ def test_few_answers_are_merged_exactly_and_many_by_points():
 def test_what_a_rule_cannot_do_is_refused():
     with pytest.raises(InputError, match="are too many"):
         rule_map(GP, cohort(), "pooled", largest=5)
-    with pytest.raises(InputError, match='only 1 of them gave an answer; use "bcm"'):
+    with pytest.raises(InputError, match='responses are from 1 participant; use "bcm"'):
         share_of(GP, cohort(people=1))
     with pytest.raises(InputError, match='the rule is "median"'):
         rule_map(GP, cohort(), "median")
-    with pytest.raises(InputError, match="nobody gave an answer"):
+    with pytest.raises(InputError, match="there are no responses"):
         rule_map(GP, jax.vmap(Trials)(*jax.tree.map(jnp.zeros_like, (*jax.tree.leaves(cohort()),))), "pooled")
 
 

@@ -51,9 +51,9 @@ def test_a_caption_is_text_in_the_description_of_its_figure():
             "validation.html", study=study, content=content, warnings=[], sections=[section | {"figures": figures}]
         )
         assert page.count("<img") == count and "&lt;foam&gt;" in page
-    assert "how often the first was preferred, with the 95 % interval" in words(page)
+    assert "preference rate of the first set of each pair, with the 95 % interval" in words(page)
     (alt,) = re.findall(r'alt="(Aggregate-best[^"]*)"', page)
-    assert alt.startswith("Aggregate-best against individual-best. How often the population&#39;s set was preferred to")
+    assert alt.startswith("Aggregate-best against individual-best. Preference rate of the population&#39;s set over")
 
 
 def test_the_lead_counts_the_people_of_the_map():
@@ -71,10 +71,10 @@ def test_the_lead_counts_the_people_of_the_map():
             patch.setattr(study_report, "rendered", lambda name, facts=facts, **given: facts.update(given) or "")
             study_report._page(folder, content, sections, [], True)
         seen.append(words(rendered("study.html", **facts | {"sections": []})))
-    assert all("What 4 participants answered, and the population map of" in page for page in seen)
-    assert "left out" not in seen[0] and "1 more is left out by the study's rule." in seen[1].replace("&#39;", "'")
-    assert "2 more are left out" in seen[2]  # D is on the map of one material
-    assert "What 1 participant answered," in words(rendered("study.html", **facts | {"sections": [], "people": 1}))
+    assert all("Responses of 4 participants, and the resulting population map of" in page for page in seen)
+    assert "excluded" not in seen[0] and "1 more is excluded by the study's rule." in seen[1].replace("&#39;", "'")
+    assert "2 more are excluded" in seen[2]  # D is on the map of one material
+    assert "Responses of 1 participant," in words(rendered("study.html", **facts | {"sections": [], "people": 1}))
 
 
 def test_a_warning_says_of_which_material_it_is():
@@ -90,8 +90,8 @@ def test_a_warning_says_of_which_material_it_is():
 
 def test_it_says_why_rules_were_not_compared():
     macro = _environment().get_template("parts.html").module.not_compared
-    assert "it takes three people" in macro(True) and "--no-compare" not in macro(True)
-    assert "--no-compare" in macro(False) and "it takes" not in macro(False)
+    assert "needs three participants" in macro(True) and "--no-compare" not in macro(True)
+    assert "--no-compare" in macro(False) and "needs" not in macro(False)
 
 
 def robust(nrmse, resampled=MappingProxyType({"median": 0.02, "95 %": 0.025}), sensitivity=None):
@@ -140,15 +140,18 @@ def test_the_page_of_a_robustness_check():
     assert "moved by 3 % or more: B." in page and "B 20.0 % flagged" in page
     assert "1.1 % 1.00 ± 0.25 75 % 7 (5)" in page and "at the lowest u" in page
     assert "ln theta +1.00 % -2.00 %" in page and "ln gap 2 +2.00 % +4.00 %" in page
-    assert "open by 2.0 % (median" in page and "so that the shift is within that sampling error" in page
+    assert (
+        "sampling error of the optimum is 2.0 % (median" in page
+        and "so that the shift is within that sampling error" in page
+    )
     moved = robust(0.03)
     assert "which is 3 % or more: it is not robust" in moved and "the shift is more than that" in moved
     assert "Sensitivity" not in moved
 
 
 def test_one_person_claims_no_sampling_error():
-    page = robust(0.01, resampled=None).replace("&#39;", "'")
-    assert "is not known: one person's answers tell nothing of sampling." in page and "sampling error" not in page
+    page = robust(0.01, resampled=None)
+    assert "With one participant the sampling error is not known." in page and "bootstrap" not in page
 
 
 def test_peaks_are_named_by_their_tops_and_a_single_one_is_not_named():

@@ -180,7 +180,7 @@ def test_the_page_says_where_the_optimum_was_searched(written):
     between = dataclasses.replace(study, space=dataclasses.replace(study.space, constraints=(constraint,)))
     page = " ".join(results_page(between, content, {}, people).split())
     assert "searched over the whole box" in results_page(study, content, {}, people)
-    assert "whole box" not in page and "where the study's constraints hold (p0" in page.replace("&#39;", "'")
+    assert "whole box" not in page and "within the study's constraints (p0" in page.replace("&#39;", "'")
 
 
 def test_figures_are_png_and_svg(written):

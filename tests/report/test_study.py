@@ -60,7 +60,7 @@ def test_limits_are_named():
     limits = limits_of(study, crowd([HILL, HILL[:2], [(0.1, 0.1, 0)] * 6]))
     assert limits[0].startswith("Fewer than 5 answers were given by P1")
     assert "between 2 and 9" in limits[1] and 'P2 ("different")' in limits[2]
-    assert "plans 25 trials; nobody has given more than 9" in limits[3]
+    assert "plans 25 trials; the largest number of responses is 9" in limits[3]
     assert limits_of(study, crowd([HILL]))[0].startswith(
         "P0 is the only participant: the population map is that person's own,"
     )
@@ -283,7 +283,7 @@ def test_a_report_of_one_person(capsys, monkeypatch, tmp_path):
     code, stdout, err = run(capsys, monkeypatch, "report", folder, "--out", out, "--no-compare", "--json")
     assert code == 0, err
     page = " ".join((out / "report.html").read_text().split())
-    assert "P1 is the only participant" in page and "1 participant gave 8 answers" in page
+    assert "P1 is the only participant" in page and "1 participant gave 8 responses" in page
     assert "recorded for 9 trials (saturated 2, slewed 1, controlled 1); excluded by [study] exclude_flags" in page
     counts = {"recorded": 9, "flagged": {"saturated": 2, "slewed": 1, "controlled": 1}, "left_out": 1}
     assert json.loads(stdout)["materials"][""]["flags"] == counts

@@ -317,9 +317,9 @@ def test_a_damping_range_fills_evenly():
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_points_of_another_number_of_coordinates_are_refused(method, count):
     """JAX takes the last coordinate again where one is missing, and leaves out what is too many."""
-    with pytest.raises(InputError, match="the last axis must hold 3 numbers, of K1, B1, alpha"):
+    with pytest.raises(InputError, match="the last axis must have 3 numbers, of K1, B1, alpha"):
         getattr(fosls(), method)(np.full(count, 0.5))
-    with pytest.raises(InputError, match="the last axis must hold 2 numbers, of bitrate, height"):
+    with pytest.raises(InputError, match="the last axis must have 2 numbers, of bitrate, height"):
         getattr(PLAIN, method)(np.full(3, 0.5))
 
 

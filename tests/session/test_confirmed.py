@@ -52,7 +52,7 @@ def test_a_value_is_taken_within_its_tolerance_and_nowhere_else(du, dv):
     if off["u"] <= 0.01 and off["v"] <= 1e-6:
         check_confirmed(STUDY.file, ASKED, values)
         return
-    with pytest.raises(RefusedError, match="was asked for") as caught:
+    with pytest.raises(RefusedError, match="was requested") as caught:
         check_confirmed(STUDY.file, ASKED, values)
     assert caught.value.code == "off"
 
@@ -69,7 +69,7 @@ def test_on_a_logarithmic_scale_a_share_of_the_value_may_be_off(wanted, stated, 
     asked_for = ASKED | {"f": wanted}
     check_confirmed(study.file, asked_for, asked_for | {"f": wanted * (1 + 0.99 * share)})
     for factor in (1 + 1.01 * share, 1 - 1.01 * share):
-        with pytest.raises(RefusedError, match="was asked for, and it may be off by"):
+        with pytest.raises(RefusedError, match="was requested, and the tolerance is"):
             check_confirmed(study.file, asked_for, asked_for | {"f": wanted * factor})
 
 
@@ -97,7 +97,7 @@ def test_what_counts_is_never_outside_the_ranges_and_nothing_else_is_changed(u, 
 def test_a_rendering_is_felt_and_answered_only_after_it_was_confirmed():
     state = started()
     state = state.after(live.present(state, 1, 0, True, 2.0))  # the reference has no values
-    with pytest.raises(RefusedError, match="nobody has confirmed") as caught:
+    with pytest.raises(RefusedError, match="it is not confirmed") as caught:
         live.present(state, 1, 1, True, 2.0)
     assert caught.value.code == "unconfirmed"
     with pytest.raises(RefusedError, match="not been felt"):
@@ -110,7 +110,7 @@ def test_a_rendering_is_felt_and_answered_only_after_it_was_confirmed():
 def test_a_presentation_that_begins_again_is_confirmed_again():
     state = felt(started())
     state = state.after(live.repeat(state, 3.0))
-    with pytest.raises(RefusedError, match="nobody has confirmed"):
+    with pytest.raises(RefusedError, match="it is not confirmed"):
         live.present(state, 1, 1, True, 4.0)
 
 
@@ -170,7 +170,7 @@ def test_a_program_renders_the_fosls_where_the_study_says_so():
     assert Study.from_dict(FOSLS).file.stimulus is None and Study.from_dict(RAW).file.stimulus is not None
     study = Study.from_dict(FOSLS | {"stimulus": {}})
     assert study.file.stimulus.role == "stimulus" and study.file.meaning != Study.from_dict(FOSLS).file.meaning
-    with pytest.raises(InputError, match="nobody renders a force by hand"):
+    with pytest.raises(InputError, match="a person cannot render a force by hand"):
         Study.from_dict(FOSLS | {"stimulus": {"by": "person"}})
 
 

@@ -193,7 +193,7 @@ def test_dry_runs_are_nobodys_answers(folder, tmp_path):
     assert heard[0] == f"{folder}: 2 dry runs are left out." and len(heard) == 2  # the other is of who validated
     assert {state.header.participant for state in read_sessions(folder, STUDY.file)} == {"P01", "P02", "P03"}
     write(tmp_path / "dry", "test", "optimisation", "1", dry_run=True)
-    with pytest.raises(InputError, match="holds nothing but dry runs"):
+    with pytest.raises(InputError, match="contains only dry runs"):
         read_sessions(tmp_path / "dry", STUDY.file)
 
 
@@ -240,7 +240,7 @@ def test_answers_of_hilbo_try_are_marked_and_not_read_beside_others(folder, tmp_
     table = trials_table(read_sessions(folder, STUDY.file))
     assert set(table.loc[table["unblinded"] == "try", "participant"]) == {"try-1"}
     assert set(table.loc[table["unblinded"].isna(), "participant"]) == {"P01", "P02", "P03"}
-    with pytest.raises(InputError, match="is an unblinded answer, as hilbo try gives"):
+    with pytest.raises(InputError, match="is an unblinded response, as of hilbo try"):
         read_log_trials(folder, STUDY.file)
     write(tmp_path / "own", "try-1", "optimisation", "1", unblinded="try")
     assert set(read_log_trials(tmp_path / "own", STUDY.file).rows["participant"]) == {"try-1"}
@@ -249,11 +249,11 @@ def test_answers_of_hilbo_try_are_marked_and_not_read_beside_others(folder, tmp_
 
 
 def test_folders_without_answers_are_refused(tmp_path):
-    with pytest.raises(InputError, match="holds no session logs"):
+    with pytest.raises(InputError, match="contains no session logs"):
         read_log_trials(tmp_path, STUDY.file)
     driver = Driver()
     EventLog.create(tmp_path / log_name(driver.header), STUDY.file, driver.header).close()
-    with pytest.raises(InputError, match="hold no answers yet"):
+    with pytest.raises(InputError, match="have no responses yet"):
         read_log_trials(tmp_path, STUDY.file)
     assert not netcdf(read_sessions(tmp_path, STUDY.file), tmp_path / "x.nc", STUDY.file)
     assert not (tmp_path / "x.nc").exists()
@@ -281,11 +281,11 @@ def test_consent_comes_before_the_first_trial(tmp_path):
     with pytest.raises(InputError, match="agreed to protocol FENS-1, the study's is FENS-2"):
         check_consent(people, "P02", "FENS-2")
     for change, sentence in (
-        ({"participant": "Ada Lovelace"}, "somebody's name"),
+        ({"participant": "Ada Lovelace"}, "a person's name"),
         ({"age": "old"}, "whole number of years"),
         ({"handedness": "paw"}, "right, left, both"),
         ({"consent_time": "yesterday"}, "write it as 2026"),
-        ({}, "stands there already"),
+        ({}, "is there already"),
     ):
         with pytest.raises(InputError, match=sentence):
             add_person(path, row | change)
@@ -293,7 +293,7 @@ def test_consent_comes_before_the_first_trial(tmp_path):
     with pytest.raises(InputError, match='1: column "consent_time" is missing'):
         read_people(path)
     path.write_text("participant,consent_time,protocol_number,note,note\nP1,2026-01-03T10:00,1,room 3,paid\n")
-    with pytest.raises(InputError, match='1: column "note" stands there twice'):
+    with pytest.raises(InputError, match='1: column "note" is there twice'):
         add_person(path, row)
     assert "room 3" in path.read_text()
 

@@ -181,5 +181,5 @@ def test_logs_under_other_names_are_named_and_files_of_macos_are_not_read(tmp_pa
 
 
 def test_a_folder_that_is_not_there_holds_no_logs(tmp_path):
-    with pytest.raises(InputError, match="holds no session logs"):
+    with pytest.raises(InputError, match="contains no session logs"):
         read_sessions(tmp_path / "nowhere", STUDY.file)

@@ -64,13 +64,13 @@ def test_a_link_to_a_drive_that_is_missing_is_refused(tmp_path):
 @pytest.mark.parametrize("ahead", ["2199-01-01", "9999-12-31T23:59-14:00"])
 def test_nobody_has_agreed_in_the_future(tmp_path, ahead):
     path = tmp_path / "participants.csv"
-    with pytest.raises(InputError, match=r"participants.csv: consent_time is .*, which is to come"):
+    with pytest.raises(InputError, match=r"participants.csv: consent_time is .*, in the future"):
         add_person(path, person("P01", ahead))
     assert not path.exists()
     path.write_text(f"participant,consent_time,protocol_number\nP01,{ahead},1\nP02,2026-05-04,1\n")
     people = read_people(path)
     assert check_consent(people, "P02")["consent_time"] == "2026-05-04"
-    with pytest.raises(InputError, match=r"participant P01: consent_time is .*, which is to come"):
+    with pytest.raises(InputError, match=r"participant P01: consent_time is .*, in the future"):
         check_consent(people, "P01")
 
 

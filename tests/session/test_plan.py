@@ -103,7 +103,7 @@ def test_validation_shows_each_pair_four_times_and_each_set_eight():
     assert len(orders) > 1
     with pytest.raises(InputError, match="give --from"):
         make_plan(STUDY.file, PEOPLE, 0, "validation")
-    with pytest.raises(InputError, match="no map of their own"):
+    with pytest.raises(InputError, match="no individual map"):
         make_plan(STUDY.file, PEOPLE, 0, "validation", sets={"": SETS}, source="individual")
 
 
@@ -114,7 +114,7 @@ def test_individual_sets_are_shown_to_their_owner_only():
     own = [name.split(" ") for name in header.sets if not name.startswith("warm-up")]
     assert sorted(role for _, role in own) == sorted(SETS) and len({code for code, _ in own}) == 1
     assert not any("P02" in name for name in header.sets)
-    with pytest.raises(InputError, match="nobody else can be validated"):
+    with pytest.raises(InputError, match="other participants cannot be validated"):
         reissue(plan, "P02", "P30")
 
 
@@ -144,7 +144,7 @@ def test_a_plan_calls_nobodys_sets_by_their_id():
 
 ROW = ("participants", 0, "header")
 FORGED_PLANS = {
-    "somebody else's session": ((*ROW, "participant"), "P02"),
+    "another participant's session": ((*ROW, "participant"), "P02"),
     "a participant who is a path": (("participants", 0, "participant"), "../P01"),
     "no blocks": ((*ROW, "blocks"), []),
     "a block that is none": ((*ROW, "blocks", 0), 7),
@@ -261,7 +261,7 @@ def test_people_are_validated_with_the_materials_of_which_they_have_a_map():
     sets = {"foam": own("P01", "P03"), "soft": own("P02", "P03"), "hard": {}}
     plan = make_plan(GROUPED.file, ["P01", "P02", "P03"], 0, "validation", sets=sets, source="individual")
     assert [sorted(row) for row in materials_of(plan)] == [["foam"], ["soft"], ["foam", "soft"]]
-    with pytest.raises(InputError, match="P04 has no map of their own"):
+    with pytest.raises(InputError, match="P04 has no individual map"):
         make_plan(GROUPED.file, ["P04"], 0, "validation", sets=sets, source="individual")
 
 
@@ -346,7 +346,7 @@ def test_results_are_checked(tmp_path):
     check_participants([aggregate_result], ["P01"], "individual")
     with pytest.raises(InputError, match="invite people who are not"):
         check_participants([aggregate_result], ["V01", "P02"], "aggregate")
-    with pytest.raises(InputError, match="no map of their own"):
+    with pytest.raises(InputError, match="no individual map"):
         check_participants([aggregate_result], ["V01"], "individual")
 
 

@@ -42,7 +42,7 @@ def test_levels_whole_numbers_constraints_and_a_person_who_presents_stand_on_the
     for part in (
         '| texture | "silk", "wood" | | | levels, without an order |',
         "| grains | 0 | 6 |  | linear, whole numbers |",
-        "Nothing is presented but what keeps -3 <= gain - 2.5 grains <= 24.",
+        "Only stimuli with -3 <= gain - 2.5 grains <= 24 are presented.",
         "A person presents them",
         "correlation 0.5 of any two levels of texture",
     ):
@@ -75,7 +75,7 @@ def test_the_page_follows_the_study(page):
         .replace('acquisition = "ucb"', 'acquisition = "top_category"')
     )
     assert "recipe learnt-1" in text and "the rest learnt" in text and "theta" not in text
-    assert "`trials < 10` holds are left out" in text
+    assert "Participants with `trials < 10` are excluded" in text
     assert "Trials with these device flags are excluded: input held (`[study] exclude_flags`)." in text
     assert "probability of the goal)" in text
 
@@ -115,7 +115,7 @@ def test_the_page_has_groups_and_protocols_by_material(tmp_path):
     own = {"aggregate": {"u": 0.5, "v": 0.5}, "individual:P01": {"u": 0.1, "v": 0.2}}
     plan = make_plan(file, ["A1"], 0, "aggregate-best", sets={"foam": own, "soft": own})
     text = registration(file, plan, "1")
-    assert "Each pair of foam comes 2 times" in text and "Each pair of soft comes 3 times" in text
+    assert "Each pair of foam is presented 2 times" in text and "Each pair of soft is presented 3 times" in text
 
 
 def test_departures_from_a_plan(tmp_path):
@@ -161,7 +161,7 @@ def test_sessions_of_several_plans_are_compared_phase_by_phase(tmp_path):
     departs, said = departures([one, asked, two], counts, held)
     assert departs == () and said[1].endswith("2 participants of the validation; all sessions followed it.")
     (unknown,), _ = departures([one, asked, two], counts)
-    assert "is of validation, and nothing says whose sessions followed it" in unknown
+    assert "is of validation, and the sessions that followed it are unknown" in unknown
 
 
 def test_another_study_file_than_the_planned_one_departs(tmp_path):
@@ -215,7 +215,7 @@ def test_sessions_that_were_held_by_no_plan_or_by_another_are_named(tmp_path):
     (sentence,), _ = said("0123", own)
     assert sentence.endswith("Sessions by another plan: P01 (session 1, plan 0123).")
     (sentence,), _ = said(own)
-    assert sentence.endswith("does not say by which plan these were held: P02.")
+    assert sentence.endswith("lacks the plan of these: P02.")
     twice = reissue(reissue(plan, "P02", "P03"), "P03", "P04")
     path.write_text(plan_text(twice))
     assert twice.replaces[0] == own and len({*twice.replaces, twice.hash}) == 3

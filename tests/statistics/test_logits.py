@@ -257,7 +257,7 @@ MISTAKES = {
     ),
     "a missing order": (
         lambda: st.tied_preferences(["a", "b"], ["b", "a"], ["a", "a"], order=[1, np.nan]),
-        "order must hold 1, -1 or 0 for each comparison: first was shown first, second, or unknown.",
+        "order must be 1, -1 or 0 for each comparison: first was shown first, second, or unknown.",
     ),
 }
 

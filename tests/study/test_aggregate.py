@@ -81,7 +81,7 @@ BAD = {
     "value outside its bounds": (spoiled("alpha", 4, 1.5), 'csv:6: alpha is "1.5".*from 0.01 to 0.99'),
     "trial that is no count": (spoiled("trial", 4, 0), 'csv:6: trial is "0"'),
     "no participant": (spoiled("participant", 4, ""), "csv:6: participant is empty"),
-    "duplicated key": (lambda f: pd.concat([f, f.iloc[[2]]]), "csv:20: participant P0, trial 3 stands in line 4"),
+    "duplicated key": (lambda f: pd.concat([f, f.iloc[[2]]]), "csv:20: participant P0, trial 3 is in line 4"),
     "missing column": (lambda f: f.drop(columns="B1"), 'csv:1: column "B1" is missing'),
     "empty table": (lambda f: f.iloc[:0], "has no rows"),
     "several materials": (lambda f: f.assign(material=["foam"] * 9 + ["silicone"] * 9), "2 materials"),
@@ -209,5 +209,5 @@ def test_a_large_cohort_is_fitted_in_batches_to_the_same_results(monkeypatch):
 def test_optima_that_were_not_sought_are_missed_in_a_sentence():
     found = aggregate_cohort(STUDY, cohort_of(table(), STUDY), alternatives=False, individuals=False)
     assert found.own is None
-    with pytest.raises(InputError, match="was not sought; aggregate with individuals=True"):
+    with pytest.raises(InputError, match="were not computed; aggregate with individuals=True"):
         _ = found.mean_of_optima

@@ -29,7 +29,7 @@ def folder_with(tmp_path, **files):
 
 
 BAD = {
-    "no trials": ({}, "holds no trials.csv"),
+    "no trials": ({}, "contains no trials.csv"),
     "the same answer twice": ({"trials__csv": HEAD + ROW, "trials-2__csv": HEAD + ROW}, "is in two trial tables"),
     "another parameter": (
         {"trials__csv": "participant,trial,response,K1,B1\nA,1,close,5,6\n"},
@@ -72,7 +72,7 @@ def test_the_report_never_replaces_what_it_reads(capsys, monkeypatch, tmp_path):
     folder = folder_with(tmp_path, trials__csv=HEAD + ROW)
     for out in (folder, tmp_path):
         code, _, stderr = run(capsys, monkeypatch, "report", folder, "--out", out, "--force")
-        assert code == 2 and "holds the folder that is read" in stderr
+        assert code == 2 and "contains the folder that is read" in stderr
     code, _, stderr = run(capsys, monkeypatch, "report", tmp_path / "none", "--out", tmp_path / "out")
     assert code == 2 and "is no folder" in stderr
     other = folder_with(tmp_path / "folder", trials__csv=HEAD + ROW)

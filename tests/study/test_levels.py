@@ -44,10 +44,13 @@ correlations = st.floats(0.02, 0.98)
         ({"levels": ["a", " b"]}, "parameters.texture.levels has ' b', a level is a text without blanks around it"),
         ({"levels": ["10", "b"]}, 'parameters.texture.levels has "10", which reads as a number; name it otherwise'),
         ({"levels": ["a", "=b"]}, 'parameters.texture.levels is ["a", "=b"], which a spreadsheet would run'),
-        ({"levels": ["a", "b"], "low": 0.0}, "parameters.texture.low stands beside levels, which have no order"),
-        ({"levels": ["a", "b"], "scale": "log"}, "parameters.texture.scale stands beside levels, which have no order"),
-        ({"levels": ["a", "b"], "integer": True}, "parameters.texture.integer stands beside levels, which have no"),
-        ({"levels": ["a", "b"], "unit": "N"}, "parameters.texture.unit stands beside levels, which have no order"),
+        ({"levels": ["a", "b"], "low": 0.0}, "parameters.texture.low is not used with levels, which have no order"),
+        (
+            {"levels": ["a", "b"], "scale": "log"},
+            "parameters.texture.scale is not used with levels, which have no order",
+        ),
+        ({"levels": ["a", "b"], "integer": True}, "parameters.texture.integer is not used with levels, which have no"),
+        ({"levels": ["a", "b"], "unit": "N"}, "parameters.texture.unit is not used with levels, which have no order"),
         (
             {"levels": ["a", "b"], "correlation": 1.0},
             "parameters.texture.correlation is 1.0; it must be a number",

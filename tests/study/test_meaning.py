@@ -173,7 +173,7 @@ def test_sessions_by_two_versions_are_read_together_and_the_table_says_in_what_t
 
 @pytest.mark.parametrize(
     ("tables", "sentence"),
-    [({}, "holds no whole study file"), (FREE["gp.noise"].file.tables, "does not fit its hash")],
+    [({}, "has no complete study file"), (FREE["gp.noise"].file.tables, "does not fit its hash")],
 )
 def test_a_log_whose_study_file_was_changed_is_refused(tmp_path, tables, sentence):
     path = answered(tmp_path, STUDY, count=0)

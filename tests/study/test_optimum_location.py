@@ -21,19 +21,19 @@ def test_inside_and_known_there_is_nothing_to_say():
 
 def test_the_edge_of_a_range_is_named():
     (sentence,) = location_sentences(STUDY, jnp.array([0.1, 0.2, 0.0]), SD, ASKED)
-    assert sentence.startswith("The optimum lies at the lowest alpha that was searched (0.01):")
+    assert sentence.startswith("The optimum is at the lowest alpha that was searched (0.01):")
 
 
 def test_a_natural_end_is_named_without_the_remark_on_what_is_beyond():
     numbers = PLAIN["parameters"] | {"u": PLAIN["parameters"]["u"] | {"natural_ends": ["low"]}}
     study = Study.from_dict(PLAIN | {"parameters": numbers})
     (sentence,) = location_sentences(study, jnp.array([0.0, 0.5]), SD, ASKED)
-    assert sentence == "The optimum lies at the natural end of u (0), beyond which nothing exists."
+    assert sentence == "The optimum is at the natural end of u (0)."
     assert location_notes(study, jnp.array([0.0, 0.5]), SD, ASKED) == ["at the natural end of u (0)"]
     far, natural = location_sentences(study, jnp.array([0.0, 1.0]), SD, ASKED)
     assert "the highest v that was searched (20)" in far and natural == sentence
     (sentence,) = location_sentences(study, jnp.array([1.0, 0.5]), SD, ASKED)
-    assert "the highest u that was searched (1): whether people" in sentence
+    assert "the highest u that was searched (1): values beyond" in sentence
     assert study.file.meaning == Study.from_dict(PLAIN).file.meaning
     assert "natural end of a range" in meanings("optima", study.file.space)["location"][1]
     assert "natural" not in meanings("optima", Study.from_dict(PLAIN).file.space)["location"][1]
@@ -43,7 +43,7 @@ def test_the_border_of_the_passive_set_is_named():
     x = STUDY.space.from_box(jnp.array([1.0, 0.5, 0.5]))
     assert 0 < float(x[0]) < 1
     (sentence,) = location_sentences(STUDY, x, SD, ASKED)
-    assert "border of what the device may render: K1 could not be higher" in sentence
+    assert "boundary of the passive region of the device: K1 could not be higher" in sentence
 
 
 def test_a_constraint_that_holds_the_optimum_is_named():
@@ -55,9 +55,7 @@ def test_a_constraint_that_holds_the_optimum_is_named():
         ([0.15, 0.05], "12 <= 10 u + v"),
     ):
         (sentence,) = location_sentences(study, jnp.array(x), SD, ASKED)
-        assert sentence.startswith(
-            f"The optimum lies on the study's constraint {words}: whether people would like what"
-        )
+        assert sentence.startswith(f"The optimum is on the study's constraint {words}: values beyond")
         assert location_notes(study, jnp.array(x), SD, ASKED) == [f"on the constraint {words}"]
     assert location_sentences(study, jnp.array([0.3, 0.69]), SD, ASKED) == []
 
@@ -70,14 +68,14 @@ def test_the_border_of_effective_damping_is_named():
         x = study.space.from_box(jnp.array([share, 0.5, 0.5]))
         assert 0 < float(x[0]) < 1
         (sentence,) = location_sentences(study, x, SD, ASKED)
-        assert f"border of the study's range of effective damping: K1 could not be {way} there" in sentence
+        assert f"boundary of the study's range of effective damping: K1 could not be {way} there" in sentence
         assert location_notes(study, x, SD, ASKED) == [f"K1 could not be {way} within the range of effective damping"]
 
 
 def test_an_extrapolation_is_called_one():
     x = jnp.array([0.1, 0.2, 0.2])
     (sentence,) = location_sentences(STUDY, x, jnp.asarray(0.9), ASKED)
-    assert "there, 0.9, is larger than wherever somebody answered (0.5 at most)" in sentence
+    assert "there, 0.9, is larger than at all tested stimuli (0.5 at most)" in sentence
     assert location_sentences(STUDY, x, jnp.asarray(0.9), None) == []
     assert location_sentences(STUDY, x, jnp.asarray(0.5), ASKED) == []
 
@@ -95,7 +93,7 @@ def test_a_row_of_a_table_has_the_same_in_a_few_words():
     assert location_notes(STUDY, jnp.array([0.1, 0.2, 0.2]), SD, ASKED) == []
     edge, beyond = location_notes(STUDY, jnp.array([0.1, 0.2, 0.0]), jnp.asarray(0.9), ASKED)
     assert edge == "at the lowest alpha that was searched (0.01)"
-    assert "less is known there than wherever somebody answered" in beyond
+    assert "its standard deviation is larger than at all tested stimuli" in beyond
 
 
 def test_a_simulated_study_says_how_far_its_truth_is():

@@ -39,12 +39,12 @@ def test_an_unlocated_optimum_says_so():
     some = np.zeros((2, 2))
     assert region_sentences(Region(some, some, 0.25)) == []
     (sentence,) = region_sentences(Region(some, some, 0.31))
-    assert sentence.startswith("The best rendering is not located: with 95% it lies in a region that takes up 31%")
+    assert sentence.startswith("Inconclusive: the 95% credible region of the optimum covers 31%")
     assert region_sentences(None) == []
     place = np.zeros(2)
     twins = Region(some, some, 0.1, (Hill(place, place, 0.6), Hill(place, place, 0.3)))
     (sentence,) = region_sentences(twins)
-    assert "on the likeliest with 60%, on the next with 30%" in sentence
+    assert "on the most probable with 60%, on the next with 30%" in sentence
 
 
 def test_of_levels_and_whole_numbers_each_rendering_counts_once():

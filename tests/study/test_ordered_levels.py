@@ -91,7 +91,7 @@ def test_positions_change_the_distances_and_equal_ones_change_nothing():
         ({"at": [0, 2, 1]}, "parameters.sugar.at is [0.0, 2.0, 1.0]; it must rise from each number to the next."),
         ({"at": [0, 1, 4], "ordered": False}, "parameters.sugar.at is of ordered levels; add ordered = true"),
         ({"correlation": 0.4}, "parameters.sugar.correlation is of unordered levels; leave it out"),
-        ({"unit": "g"}, "parameters.sugar.unit stands beside levels, which have no numbers"),
+        ({"unit": "g"}, "parameters.sugar.unit is not used with levels, which have no numbers"),
         (
             {"natural_ends": ["low"], "ordered": False},
             "parameters.sugar.natural_ends is of ordered levels; add ordered",
@@ -116,9 +116,9 @@ def test_an_order_is_refused_for_numbers_and_lengths_count_it():
 def test_the_end_of_an_order_is_named_by_its_level():
     sd, asked = jnp.asarray(0.3), jnp.asarray(0.25)
     (sentence,) = location_sentences(drinks(), jnp.array([1.0, 0.5]), sd, asked)
-    assert sentence.startswith("The optimum lies at the highest sugar that was searched (high): whether")
+    assert sentence.startswith("The optimum is at the highest sugar that was searched (high): values")
     (sentence,) = location_sentences(drinks(natural_ends=["low"]), jnp.array([0.0, 0.5]), sd, asked)
-    assert sentence == "The optimum lies at the natural end of sugar (low), beyond which nothing exists."
+    assert sentence == "The optimum is at the natural end of sugar (low)."
 
 
 @pytest.mark.deep
@@ -152,6 +152,6 @@ def test_a_study_with_an_order_is_reported(tmp_path, capsys, monkeypatch, rule):
     content = json.loads(text)
     assert set(pd.read_csv(folder / "trials.csv")["sugar"]) <= set(NAMES)
     assert content["optimum"]["parameters"]["sugar"] == "low"
-    assert "The optimum lies at the natural end of sugar (low), beyond which nothing exists." in content["warnings"]
+    assert "The optimum is at the natural end of sugar (low)." in content["warnings"]
     page = " ".join((folder / "report.html").read_text().split())
-    assert "beyond which nothing exists" in page and "low &lt; medium &lt; high" in page
+    assert "the natural end of sugar (low)." in page and "low &lt; medium &lt; high" in page

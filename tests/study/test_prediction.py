@@ -67,9 +67,9 @@ def test_ones_own_table_is_a_cohort_with_the_bits_of_a_file(table, cohort, tmp_p
         (lambda t: t.drop(columns="v"), 'DataFrame: column "v" is missing; a trial table of this study has'),
         (lambda t: t.assign(participant=np.nan), "DataFrame: row 1: participant is empty"),
         (lambda t: t.assign(response="fine"), 'DataFrame: row 1: response is "fine"; it must be one of'),
-        (lambda t: pd.concat([t, t]), "DataFrame: row 13: participant 7, trial 1 stands in row 1 already"),
+        (lambda t: pd.concat([t, t]), "DataFrame: row 13: participant 7, trial 1 is in row 1 already"),
         (lambda t: t.iloc[:0], "DataFrame: has no rows"),
-        (lambda t: pd.concat([t, t[["u"]]], axis=1), 'DataFrame: column "u" stands there twice; keep one of them.'),
+        (lambda t: pd.concat([t, t[["u"]]], axis=1), 'DataFrame: column "u" is there twice; remove one of them.'),
     ],
 )
 def test_what_is_wrong_with_ones_own_table_is_one_sentence(table, change, sentence):
@@ -133,7 +133,7 @@ def test_what_cannot_be_predicted_is_one_sentence(one, people):
     for model, table, words in (
         (one, ask.assign(v=9.0), 'DataFrame: row 1: v is "9.0"; it must be a number from 10 to 20'),
         (one, ask[["u"]], 'DataFrame: column "v" is missing; a rendering of this study has u, v.'),
-        (people, ask, "predict_table: the posterior holds several people"),
+        (people, ask, "predict_table: the posterior is of several participants"),
     ):
         with pytest.raises(InputError) as refused:
             predict_table(STUDY, model, table)

@@ -67,13 +67,13 @@ def advice(learnt, people=12, spread=0.5, paired=0.01, **costs):
 def test_the_best_is_recommended_where_the_others_are_worse():
     """0.05 is a third of a mean cost's error, and far more than the difference's."""
     words = advice(share(0.5, 40.0), bcm=2.2, hierarchical=2.15, average=2.3)
-    assert "People differ" in words and "use hierarchical" in words and "Exploratory" in words
+    assert "Participants differ" in words and "use hierarchical" in words and "Exploratory" in words
     alike = advice(share(0.5, 40.0), bcm=2.1, hierarchical=2.15, average=2.3)  # best, though people differ
-    assert "No rule is recommended: bcm takes people to be alike" in alike and "use bcm" not in alike
+    assert "No method is recommended: bcm assumes identical participants" in alike and "use bcm" not in alike
 
 
 def test_nothing_is_recommended_on_a_tie():
     words = advice(share(0.9, -2.0), bcm=2.2, hierarchical=2.204, average=2.4, paired=0.2)
-    assert "Nothing says that people differ" in words
-    assert "No rule is recommended: hierarchical predicts as well" in words and "use bcm" not in words
-    assert "hardly told from chance" in advice(share(0.5, 40.0), 4, bcm=2.2, hierarchical=2.1)
+    assert "There is no evidence that participants differ" in words
+    assert "No method is recommended: hierarchical predicts as well" in words and "use bcm" not in words
+    assert "hardly distinguishable from chance" in advice(share(0.5, 40.0), 4, bcm=2.2, hierarchical=2.1)

@@ -269,7 +269,7 @@ def test_one_material_is_chosen(tmp_path):
     text = "material," + HEADER + "foam,A,1,close,1,2\ngel,A,1,different,1,2\n"
     assert read_trials(written(tmp_path, text), study(), "gel")["category"].tolist() == [0]
     assert "2 materials (foam, gel); choose" in refusal(tmp_path, text)
-    assert 'holds no material "silk"; it has foam, gel' in refusal(tmp_path, text, material="silk")
+    assert 'contains no material "silk"; it has foam, gel' in refusal(tmp_path, text, material="silk")
     assert 'column "material" is missing' in refusal(tmp_path, HEADER + "A,1,close,1,2\n", material="gel")
 
 
@@ -295,9 +295,9 @@ BAD = {
     "second line": ("A,1,close,1,2\nA,2,near,1,2", 't.csv:3: response is "near"'),
     "twice": (
         "A,1,close,1,2\nB,1,close,1,2\nA,1,similar,1,3",
-        "t.csv:4: participant A, trial 1 stands in line 2 already",
+        "t.csv:4: participant A, trial 1 is in line 2 already",
     ),
-    "twice, spelt otherwise": ("A,1,close,1,2\nA,1.0,similar,1,3", "t.csv:3: participant A, trial 1 stands in line 2"),
+    "twice, spelt otherwise": ("A,1,close,1,2\nA,1.0,similar,1,3", "t.csv:3: participant A, trial 1 is in line 2"),
     "underscore": ("A,1,close,1_5,2", 'gain is "1_5"'),
     "one cell more": ("A,1,close,1,2,3", "t.csv:2: has 6 cells, the header has 5; fix that line"),
     "one cell less": ("A,1,close,1,2\nA,2,close,1", "t.csv:3: has 4 cells, the header has 5"),
@@ -323,7 +323,7 @@ def test_a_missing_column_is_named(tmp_path, missing):
 
 
 def test_a_column_twice_is_refused(tmp_path):
-    assert 't.csv:1: column "gain" stands there twice' in refusal(
+    assert 't.csv:1: column "gain" is there twice' in refusal(
         tmp_path, HEADER.replace("\n", ",gain\n") + "A,1,close,1,2,1\n"
     )
 
@@ -362,9 +362,7 @@ def test_a_voided_flag_is_yes_or_no(tmp_path):
 def test_unblinded_answers_are_not_read_beside_others(tmp_path):
     head = HEADER.replace("\n", ",unblinded,voided\n")
     text = head + "A,1,close,1,2,,0\nB,1,close,1,2,try,0\n"
-    assert refusal(tmp_path, text, others=False).startswith(
-        "t.csv:3: is an unblinded answer, as hilbo try gives, beside"
-    )
+    assert refusal(tmp_path, text, others=False).startswith("t.csv:3: is an unblinded response, as of hilbo try, among")
     for kept in (head + "B,1,close,1,2,try,0\nB,2,close,1,2,try,0\n", text.replace("try,0", "try,1")):
         assert len(read_trials(written(tmp_path, kept), study(), note=str)) == kept.count(",0\n")
     assert len(read_trials(written(tmp_path, text), study(stimulus={"unblinded": True}))) == 2
@@ -409,7 +407,7 @@ def test_a_damaged_row_far_down_is_found_with_its_line(tmp_path, monkeypatch):
     assert 't.csv:41: response is "near"' in refusal(tmp_path, text.replace("P7,5,close", "P7,5,near"))
     assert "t.csv:41: has 4 cells" in refusal(tmp_path, text.replace("P7,5,close,1", "P7,5,close"))
     again = refusal(tmp_path, text.replace("P9,1,", "P0,2,"))  # two pieces apart
-    assert "t.csv:47: participant P0, trial 2 stands in line 3 already" in again
+    assert "t.csv:47: participant P0, trial 2 is in line 3 already" in again
 
 
 def test_other_columns_may_be_left_out(tmp_path):
@@ -428,7 +426,7 @@ def test_a_parquet_file_has_rows_and_no_lines(tmp_path):
 
     assert 't.parquet: row 7: gain is "9.0"; it must be' in refused(good.assign(gain=[1.0] * 6 + [9.0] * 14))
     twice = refused(pd.concat([good, good.iloc[[3]]]))
-    assert "t.parquet: row 21: participant P0, trial 4 stands in row 4 already" in twice
+    assert "t.parquet: row 21: participant P0, trial 4 is in row 4 already" in twice
     assert 't.parquet: column "gain" is missing' in refused(good.drop(columns="gain"))
     mixed = good.astype({"gain": object})
     mixed.loc[2, "gain"] = None
@@ -494,8 +492,8 @@ def test_labels_with_commas_stay_labels_where_commas_are_decimal(tmp_path):
 
 EDITS = {
     "other units": (lambda t: t.assign(gain=t["gain"] * 1000), 'gain is "1000.0"'),
-    "twice the same": (lambda t: pd.concat([t, t]), "row 4: participant A, trial 1 stands in row 1 already"),
-    "two materials": (lambda t: t.assign(material=["foam", "foam", "gel"]), "holds 2 materials (foam, gel)"),
+    "twice the same": (lambda t: pd.concat([t, t]), "row 4: participant A, trial 1 is in row 1 already"),
+    "two materials": (lambda t: t.assign(material=["foam", "foam", "gel"]), "contains 2 materials (foam, gel)"),
     "a number that is missing": (lambda t: t.assign(gain=[1.0, np.nan, 1.0]), 'gain is ""'),
     "a participant who is missing": (lambda t: t.assign(participant=["A", None, "B"]), "participant is empty"),
     "cells that are lists": (lambda t: t.assign(session=[[1], [2], [3]], gain=9.0), 'gain is "9.0"'),

@@ -52,7 +52,7 @@ def test_what_was_voided_or_a_warm_up_is_left_out(tmp_path):
 
 def test_a_material_is_chosen(tmp_path):
     path = write(tmp_path, *GOOD, "P1,silicone,1,1,best,mid,a,close,close,a")
-    with pytest.raises(InputError, match=r"holds 2 materials \(foam, silicone\); choose one of them"):
+    with pytest.raises(InputError, match=r"contains 2 materials \(foam, silicone\); choose one of them"):
         read_validation(path)
     assert len(read_validation(path, material="silicone")) == 1
     with pytest.raises(InputError, match='no comparisons of material "steel"; it has foam, silicone'):
@@ -67,7 +67,7 @@ def test_a_material_is_chosen(tmp_path):
         ("P1,foam,1,x,best,mid,a,close,close,a", ':5: trial is "x"'),
         ("P1,foam,1,3,best,,a,close,close,a", ":5: set_b is empty"),
         ("P1,foam,1,3,best,best,a,close,close,a", ':5: set_a and set_b are both "best"'),
-        ("P1,foam,1,3,a,best,a,close,close,a", ':5: set_a is "a", which has a meaning of its own'),
+        ("P1,foam,1,3,a,best,a,close,close,a", ':5: set_a is "a", which has a fixed meaning'),
         ("P1,foam,1,3,best,mid,c,close,close,a", ':5: first is "c"; it must be best, mid, or empty'),
         (
             "P1,foam,1,3,best,mid,a,near,close,a",
@@ -76,8 +76,8 @@ def test_a_material_is_chosen(tmp_path):
         ("P1,foam,1,3,best,mid,a,close,4,a", ':5: class_b is "4"'),
         ("P1,foam,1,3,best,mid,a,close,close,worst", ':5: preferred is "worst"; it must be best, mid, tie, or empty'),
         ("P1,foam,1,3,best,mid,tie,close,close,a", ':5: first is "tie"'),
-        ("P1,foam,1,3,best,mid,a,,,", ":5: holds no answer"),
-        ("P1,foam,1,2,best,mid,a,close,close,a", ":5: participant P1, trial 2 stands there already"),
+        ("P1,foam,1,3,best,mid,a,,,", ":5: has no response"),
+        ("P1,foam,1,2,best,mid,a,close,close,a", ":5: participant P1, trial 2 is there already"),
         ("P1,foam,1,3,best,mid,a,close,close", ":5: has 9 cells, the header has 10"),
     ],
 )
@@ -115,7 +115,7 @@ def test_sets_are_read(tmp_path):
     ("row", "sentence"),
     [
         (",aggregate,5,101,0.001", ":3: set_id is empty"),
-        ("best,aggregate,5,101,0.001", ':3: set_id "best" stands there already'),
+        ("best,aggregate,5,101,0.001", ':3: set_id "best" is there already'),
         ("x,someone,5,101,0.001", ':3: source is "someone"; it must be aggregate, sysid or individual:PARTICIPANT'),
         ("x,individual:,5,101,0.001", ':3: source is "individual:"'),
         ("x,sysid,five,101,0.001", ':3: K1 is "five"; it must be a finite number'),
@@ -130,7 +130,7 @@ def test_a_bad_set_is_named(tmp_path, row, sentence):
         sets_frame(write(tmp_path, "best,aggregate,5,101,0.001", row, head=SETS), ["K1"])
     assert f"table.csv{sentence}" in str(caught.value)
     twice = SETS.replace("N", "K1", 1)
-    with pytest.raises(InputError, match='column "K1" stands there twice'):
+    with pytest.raises(InputError, match='column "K1" is there twice'):
         sets_frame(write(tmp_path, "best,aggregate,5,5,0.001", head=twice), ["K1"])
     with pytest.raises(InputError, match='column "B1" is missing'):
         sets_frame(write(tmp_path, "best,aggregate,5,101,0.001", head=SETS), ["K1", "B1"])

@@ -182,7 +182,7 @@ class Schedule:
             try:
                 add_person(path, row)
             except InputError as error:
-                if "stands there already" not in str(error):  # it was killed after that
+                if "is there already" not in str(error):  # it was killed after that
                     raise
 
         return self._until_done(command)

@@ -115,7 +115,7 @@ async def _estop(rig: Rig) -> dict[str, str]:
     try:
         await rig.estop()
     except (RuntimeError, ValueError) as error:
-        raise NotNowError(f"The {rig.title.lower()} could not be told: {error}") from None
+        raise NotNowError(f"The {rig.title.lower()} could not be sent the order: {error}") from None
     return {"done": "estop"}
 
 

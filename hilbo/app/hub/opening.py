@@ -58,7 +58,7 @@ def opened(
     delay (s); a study with [stimulus] has no device. `say` is told of progress. Raises `InputError`, with the log
     closed and, if new, deleted."""
     study = Study.load(wanted.study).file
-    say("preparing what chooses")
+    say("compiling the trial selection")
     import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
 
     log, chooser = (_resumed if wanted.resume else _begun)(wanted, study)

@@ -164,7 +164,7 @@ class Runner:
             if newest.seq == event.seq - 1:
                 return event
             if newest.need != state.need or newest.trials != state.trials:
-                raise RefusedError("nothing", "what is to be proposed has changed.")
+                raise RefusedError("nothing", "the next proposal has changed.")
             return Event(seq=newest.seq + 1, kind=event.kind, time=at, data=event.data)
 
         self.clock["chosen"] = time.perf_counter() - begun

@@ -24,7 +24,7 @@ _SAME = (
 )
 _WHOLE = ("study", "screen", "seq", "block", "pending", "paused", "aborted", "notes", "began", "last", "participant")
 _TRIAL = ("id", "phase", "number", "status", "presentation", "step", "values", "answered")
-_BANNER = "Blind: this page shows no parameter; labels stand for what is presented"
+_BANNER = "Blind: this page shows no parameter; stimuli are shown as labels"
 
 
 def experimenter(hub: HubInterface, seen: Mapping[str, Any]) -> View:

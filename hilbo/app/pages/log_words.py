@@ -16,9 +16,15 @@ __all__ = ["line", "meant", "place_of", "sentence", "table"]
 
 _QUICK = 0.5  # s
 _Data = Mapping[str, Any]  # of an event
-_SHOWN = {"reference": "the reference", "a": "rendering A", "b": "rendering B", "neutral": "nothing"}
+_SHOWN = {"reference": "the reference", "a": "stimulus A", "b": "stimulus B", "neutral": "nothing"}
 _WHO = {"stimulus": "The program that presents", "preparer": "The preparer"}
-_DEVICE = {"ready": "is ready", "running": "renders", "stopped": "is at rest", "hold": "holds", "estop": "was stopped"}
+_DEVICE = {
+    "ready": "is ready",
+    "running": "renders",
+    "stopped": "is stopped",
+    "hold": "is in hold",
+    "estop": "was stopped",
+}
 
 
 def place_of(trial: Trial) -> str:
@@ -108,7 +114,7 @@ def _flags(telemetry: Mapping[str, int] | None) -> str:
 def _repeated(trial: Trial, name: str, seq: int) -> str:
     """Whether a trial will be repeated later (if it was answered before event number `seq`) or begins again now."""
     answered = trial.answered is not None and trial.answered["seq"] < seq
-    return f"{name} will be asked once more, later." if answered else f"{name} begins again from its first step."
+    return f"{name} will be repeated later." if answered else f"{name} begins again from its first step."
 
 
 def _device(state: LiveSession, name: str, data: _Data) -> str:
@@ -127,7 +133,7 @@ def _device(state: LiveSession, name: str, data: _Data) -> str:
 
 _SENTENCES: dict[str, Callable[[LiveSession, str, _Data], str]] = {
     "propose": _proposed,
-    "sent": lambda _, name, data: f"{name}: {_SHOWN[data['side']]} is in force.",
+    "sent": lambda _, name, data: f"{name}: {_SHOWN[data['side']]} is active.",
     "stimulus": _presented,
     "missed": lambda _, name, data: f"{name} is void, {_SHOWN[data['show']]} was not presented{_because(data)}",
     "answer": _answered,
@@ -135,7 +141,7 @@ _SENTENCES: dict[str, Callable[[LiveSession, str, _Data], str]] = {
     "void": lambda _, name, data: f"{name} is made void{_because(data)}",
     "restore": lambda _, name, data: f"The answer to {name} counts again.",
     "skip": lambda _, name, data: f"{name} is left out{_because(data)}",
-    "pause": lambda _, name, data: f"A break, asked for by the {data['by']}.",
+    "pause": lambda _, name, data: f"A break, requested by the {data['by']}.",
     "resume": lambda _, name, data: "The break is over.",
     "abort": lambda _, name, data: f"The session is ended early{_because(data)}",
     "note": lambda _, name, data: f"Note: {data['text']}",
@@ -191,7 +197,7 @@ def _remark(state: LiveSession, trial: Trial) -> str:
         "void": "void",
         "left out": "left out",
         "undone": "answer taken back",
-        "dropped": "not asked: an earlier answer changed, or the warm-up came again",
+        "dropped": "not presented: an earlier response changed, or the warm-up was repeated",
         "pending": "now",
     }.get(trial.status)
     words = [f"{status}: {reason}" if status and reason else status] if status else []

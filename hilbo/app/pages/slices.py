@@ -55,12 +55,12 @@ class Maps:
         if trust is not None:
             parameters = ((p, trust.best[p.name]) for p in state.study.space.parameters)
             named = (f"{p.name} {p.words(value) if p.levels else f'{value:.3g}'}" for p, value in parameters)
-            rows.append(["Best so far", ", ".join(named)])
+            rows.append(["Current optimum", ", ".join(named)])
             if trust.movement is not None:
-                rows.append(["… moves with one more", f"by {100 * trust.movement:.1f} % of the ranges"])
+                rows.append(["Expected shift after one more trial", f"{100 * trust.movement:.1f} % of the ranges"])
         twice = progress.consistency(state)
         if twice.pairs:
-            rows.append(["Asked twice", f"{twice.alike} of {twice.pairs} alike"])
+            rows.append(["Test–retest agreement", f"{twice.alike} of {twice.pairs}"])
         return rows
 
     def slices(self, state: LiveSession) -> dict[str, Any] | None:

@@ -162,7 +162,7 @@ def _banners(hub: HubInterface) -> list[str]:
     """Notices of a session whose data are not ordinary: dry run, simulated device, unblinded."""
     header, banners = hub.state.header, []
     if header.dry_run:
-        banners.append("Dry run: nobody takes part, and no table has these answers")
+        banners.append("Dry run: without a participant; these responses are in no table")
     if hub.rig.simulated:
         banners.append("Simulated device: nothing moves")
     if header.unblinded:

@@ -101,9 +101,9 @@ class StimulusRig:
         if self._run and another:
             raise OverError(_HEARD.format(name=hello.name, silence=self._table.silence))
         if self._run:
-            self._drop_program("Another program has taken over what presents.")
+            self._drop_program("Another program has taken over the presentation.")
         self._hello, self._run, self._key, self._stop_s = hello, secrets.token_urlsafe(12), key, None
-        self._update(self.snapshot._replace(lost=f"{hello.name} has joined, and is told to stop, to see that it does."))
+        self._update(self.snapshot._replace(lost=f"{hello.name} has joined; its stop is being tested."))
         self._order("stop")
         self._restart_silence()
         limits = {"silence_s": self._table.silence, "within_s": self._table.within}
@@ -125,7 +125,7 @@ class StimulusRig:
         Raises `OverError`; one about the order is also shown to the experimenter.
         """
         if not self._run or report.run != self._run:
-            raise OverError("This run is not the one that presents; say hello first, or end.")
+            raise OverError("This run is not the current one; send hello first, or end.")
         self._restart_silence()
         try:
             self._apply(report)
@@ -155,7 +155,7 @@ class StimulusRig:
         elif report.state == "neutral":
             self._neutral(order)
         elif report.state == "failed":
-            self._reject(f"failed: {report.why or 'the program does not say why'}")
+            self._reject(f"failed: {report.why or 'the program gives no reason'}")
 
     def _confirm(self, order: Order, report: Report) -> None:
         """Accept that the order's step is presented, which ends `show`; the same confirmation again changes nothing. A
@@ -269,7 +269,7 @@ class StimulusRig:
         end = time.monotonic() + self._hello.neutral_within_s + _TRAVEL
         while self._stop_s is None:
             if time.monotonic() > end:
-                what = "use the switch beside the hand" if self._has_force else "look at it"
+                what = "use the hardware switch" if self._has_force else "look at it"
                 raise RuntimeError(f"it has not acknowledged the stop; {what}.")
             await self._wait_for(self._moved, end - time.monotonic())
 
@@ -302,7 +302,7 @@ class StimulusRig:
         self._replace_order(Order(self.order.number + 1, do, showing, trial))
         program = self._hello
         if program is not None and do != "present" and (program.force or do == "stop"):
-            words = f"{program.name} has not said that it is neutral, {program.neutral_within_s:g} s after it was told."
+            words = f"{program.name} has not confirmed neutral within {program.neutral_within_s:g} s of the order."
             self._start_timer("neutral", program.neutral_within_s + _TRAVEL, words)
 
     def _restart_silence(self) -> None:

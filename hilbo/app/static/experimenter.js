@@ -7,7 +7,7 @@ const put = (id, text) => { if (at(id).textContent !== text) at(id).textContent 
 const server = requests(keyOf("experimenter"));
 const SAID = 10000;                  // ms that a refusal stays on the page
 let view = null, mapOf = null, map = null, lastEscape = 0;
-let said = { text: "", until: 0 };   // what this page has to say itself, beside the server's alert
+let said = { text: "", until: 0 };   // the page's own message, in addition to the server's alert
 
 function number(value, digits = 4) {
   if (value === null || value === undefined) return "–";
@@ -95,7 +95,7 @@ function drawAnswers() {
 // The button beside a voided answer.
 function restoring(meant) {
   const button = Object.assign(document.createElement("button"), { textContent: "Restore", className: "restore" });
-  button.setAttribute("aria-label", `Restore the answer to trial ${meant.name}`);
+  button.setAttribute("aria-label", `Restore the response to trial ${meant.name}`);
   button.addEventListener("click", async () => {
     const more = await sure("restore", meant);
     if (more) command("restore", more);
@@ -130,8 +130,8 @@ function showMap() {
   put("scale-low", number(low, 2)); put("scale-high", number(high, 2));
   put("map-title", high > low ? "Posterior mean, slices through the optimum" : "Posterior mean: the same everywhere so far");
   put("legend", [
-    high > low ? "Cross: the optimum." : "", "Circles: rated stimuli, darker for higher answers, fainter away from the slice.",
-    marks.some((t) => t.now) ? "Red ring: what is presented now." : "",
+    high > low ? "Cross: the optimum." : "", "Circles: rated stimuli, darker for higher responses, fainter away from the slice.",
+    marks.some((t) => t.now) ? "Red ring: the stimulus presented now." : "",
     infeasible(slices) ? "Hatched: infeasible." : "",
   ].filter(Boolean).join(" "));
   drawMap(at("map"), slices, ranges);
@@ -146,16 +146,16 @@ async function command(name, more = {}) {
     say(reply.ok ? "" : news.error);
     return reply.ok ? news : null;
   } catch {
-    say("The server does not answer; look at the terminal it was started in.");
+    say("The server does not respond; see the terminal in which it was started.");
     return null;
   }
 }
 
-const SURE = { abort: () => "End the session here? What has been answered stays; nothing more is asked.",
-               void: (name) => `Void trial ${name}? Its answer, if there is one, is not used; it stays in the log.`,
-               restore: (name) => `Restore the answer to trial ${name}? It counts again; the trial is not asked once more.`,
-               skip: (name) => `Leave trial ${name} out? It is not asked again, and the session ends with one answer less.`,
-               undo: (name) => `Take the answer to trial ${name} back? The trial is asked again.` };
+const SURE = { abort: () => "End the session here? The responses remain; no further trial is presented.",
+               void: (name) => `Void trial ${name}? Its response, if there is one, is not used; it stays in the log.`,
+               restore: (name) => `Restore the response to trial ${name}? It counts again; the trial is not repeated.`,
+               skip: (name) => `Leave trial ${name} out? It is not presented again, and the session ends with one response less.`,
+               undo: (name) => `Undo the response to trial ${name}? The trial is presented again.` };
 
 // What to send along: the trial that was meant when it was asked, and the reason; null for "Go back".
 function sure(name, meant = view.means[name]) {

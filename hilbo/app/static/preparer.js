@@ -15,7 +15,7 @@ let run = null, silence = 10, units = {}, tolerances = {}, levels = {};
 let order = { order: 0, do: "neutral" }, done = "neutral";   // the newest order, and what was done about it
 let since = 0, heard = 0, alerted = "", over = "";           // when it came, when the server was heard (performance.now())
 let presentedBefore = false;         // something stands there that is to be taken away
-let asking = false;                  // what is in the way
+let asking = false;                  // the reason is being entered
 
 async function post(path, content) {
   const reply = await server.ask(path, content, 1000 * silence);
@@ -34,7 +34,7 @@ async function ready() {
     }
     put("what", found.study);
     take(found);
-    await report("neutral");         // whoever presses Ready says that nothing is presented
+    await report("neutral");         // Ready reports that nothing is presented
     listen(run);
   } catch { lost("The server does not answer."); }
 }
@@ -51,7 +51,7 @@ async function listen(mine) {
   }
 }
 
-// `settles`: somebody has pressed a button, and this is what they said.
+// `settles`: the report of a button that was pressed.
 async function report(state, more = {}, settles = true) {
   const about = order, trial = state === "presented" ? { trial: about.trial } : {};
   const [status, found] = await post("/api/preparer", { run, order: about.order, state, ...trial, ...more });
@@ -119,11 +119,11 @@ function phase() {
 
 const WORDS = {
   over: ["This page is no longer part of the session", "", ""],
-  ready: ["Are you there, and is nothing presented?", "What you are to present stands here, one after the other. Keep this page open, and let nobody else see it.", "Ready"],
-  present: ["", "Present this, correct what stands here if something else is in force, then press.", "Presented"],
-  shown: ["It is presented", "Leave it as it is.", ""],
-  away: ["Take it away", "The participant answers.", "Taken away"],
-  wait: ["Nothing is to be presented now", "The next one comes by itself.", ""],
+  ready: ["Are you there, and is nothing presented?", "The stimuli to present are shown here, one after the other. Leave this page open, and do not show it to others.", "Ready"],
+  present: ["", "Present this, correct the values here if the presented ones differ, then press.", "Presented"],
+  shown: ["It is presented", "Do not change it.", ""],
+  away: ["Take it away", "The participant is responding.", "Taken away"],
+  wait: ["Nothing to present now", "The next stimulus will be shown here.", ""],
   stop: ["Stop: take everything away at once", "Then press.", "Nothing is presented"],
 };
 

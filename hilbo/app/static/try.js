@@ -77,7 +77,7 @@ function end(sentence) {
 }
 
 async function enter() {
-  // The link holds the participant's token and the stimulus'; what they are traded for outlives a reload of the page.
+  // The link contains the tokens of the participant and of the stimulus; the keys outlive a reload of the page.
   const [participant, stimulus] = location.hash.slice(1).split(".");
   history.replaceState(null, "", "/try");
   if (stimulus) {
@@ -114,14 +114,14 @@ async function present() {
       else if (reply.status === 409 && reply.said.order) obey(reply.said);
       else if (reply.status === 409 && run) run = null;
       else if (reply.status === 409) {                            // until the other window is no longer taken for heard
-        if (++waited > 10) put("hint", "Another window had this session; it goes on here in a few seconds.");
+        if (++waited > 10) put("hint", "Another window had this session; it continues here in a few seconds.");
         await sleep(200);
       }
       else { end(reply.said.error || "The server does not answer any more."); return; }
     } catch {
       run = null;
       obey({ order: 0, do: "neutral" });
-      put("hint", "hilbo try does not answer. Has it been ended where it was started?");
+      put("hint", "hilbo try does not respond. It may have been ended in its terminal.");
       await sleep(1000);
     }
   }

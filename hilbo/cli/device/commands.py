@@ -25,7 +25,7 @@ __all__ = ["app"]
 
 
 app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode="markdown", help="A rendering device: connect, send sets, feel, measure."
+    no_args_is_help=True, rich_markup_mode="markdown", help="Haptic device: connect, send sets, feel, measure."
 )
 for name, command in (measure.COMMANDS | commission.COMMANDS).items():
     app.command(name)(command)
@@ -33,7 +33,7 @@ for name, command in (measure.COMMANDS | commission.COMMANDS).items():
 _LEAVES = 10.0  # s for a handle that is pressed to leave
 _PIECE = 1.0  # s of a recording between two writes to its file
 
-Seconds = Annotated[float | None, typer.Option(help="End after so many seconds of the device's time.")]
+Seconds = Annotated[float | None, typer.Option(help="End after this device time, s.")]
 
 
 @app.command()
@@ -49,7 +49,7 @@ def ports(as_json: JsonToo = False) -> None:
 @app.command()
 @takes(line=Line)
 def hello(line: Line, as_json: JsonToo = False) -> None:
-    """Identify the device: version, limits, damping, stroke, capabilities, and the set in force."""
+    """Identify the device: version, limits, damping, stroke, capabilities, and the active set."""
     from dataclasses import asdict
 
     from hilbo.device.reasons import Capability
@@ -77,7 +77,7 @@ def hello(line: Line, as_json: JsonToo = False) -> None:
 @app.command("set")
 @takes(chosen=Chosen, line=Line)
 def set_(chosen: Chosen, line: Line, as_json: JsonToo = False) -> None:
-    """Put a set in force, read it back bit for bit, and print it. Nothing is started."""
+    """Activate a set, read it back bit for bit, and print it. Nothing is started."""
     wanted = chosen_set(chosen, line)
     if wanted is None:
         raise InputError("No set is given; a set has --K1, --B1 and --alpha, or --sets and --name.")
@@ -89,7 +89,7 @@ def set_(chosen: Chosen, line: Line, as_json: JsonToo = False) -> None:
 @app.command()
 @takes(chosen=Chosen, line=Line)
 def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: JsonToo = False) -> None:
-    """Render the set that is in force, or the one that is given, until Ctrl-C; then stop.
+    """Render the active set, or the given one, until Ctrl-C; then stop.
 
     Ends at once, with the reason and exit code 1, if the device goes to HOLD or ESTOP.
     """
@@ -108,7 +108,7 @@ def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: JsonToo 
 @app.command()
 @takes(line=Line)
 def stop(line: Line, as_json: JsonToo = False) -> None:
-    """Force to zero, smoothly, even if another program started it; prints that it is done. Needs --device."""
+    """Ramp the force to zero, even if another program started it, and confirm. Needs --device."""
     _at_once(line, "Stop", as_json)
 
 
@@ -146,7 +146,7 @@ def record(
     out: Annotated[Path, typer.Argument(help="CSV file to write.", show_default=False)],
     chosen: Chosen,
     line: Line,
-    seconds: Annotated[float, typer.Option(min=0.001, help="So many seconds of the device's time.")] = 5.0,
+    seconds: Annotated[float, typer.Option(min=0.001, help="Duration in device time, s.")] = 5.0,
     render: Annotated[bool, typer.Option("--render/--no-render", help="Start the set first, and stop after.")] = True,
     force: ForceFile = False,
     as_json: JsonToo = False,
@@ -168,7 +168,7 @@ def record(
             if not samples:
                 raise ended or KeyboardInterrupt
         if ended is not None:
-            raise DeviceError(f"{ended} {out} holds the {samples} samples until then.") from ended
+            raise DeviceError(f"{ended} {out} contains the {samples} samples until then.") from ended
         state, counts = device.state().name, device.counts()
     content = {"file": str(out), "samples": samples, "state": state, "counts": counts._asdict()}
     print_result(content, f"{out}: {samples} samples", as_json)

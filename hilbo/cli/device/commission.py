@@ -29,7 +29,7 @@ def home(
     with opened(line) as device:
         device.home(position)
         position = device.status().position_mm
-    print_result({"position_mm": position}, f"homed: the handle stands at {position:.6g} mm", as_json)
+    print_result({"position_mm": position}, f"homed: the handle is at {position:.6g} mm", as_json)
 
 
 @takes(line=Line)
@@ -104,7 +104,7 @@ class _Terminal:
     def place(self, moved_mm: float) -> float:
         """Ask the person to hold the handle at the surface, and return its position, 0 mm. Raises `InputError` at the
         end of the input. `moved_mm` is not needed for that."""
-        _ask("The motor is at rest. Place the handle at the surface, hold it there, and press Enter.")
+        _ask("The motor is at rest. Place the handle at the surface, do not move it, and press Enter.")
         if not sys.stdin.readline():
             raise InputError("The handle was not placed at the surface (end of input); commission the device again.")
         return 0.0
@@ -147,7 +147,9 @@ def _person(no_hand: str | None, encoder_checked: bool, position: float | None) 
             f' --no-hand-on-the-handle "{PHRASE}".'
         )
     if position is not None:
-        raise InputError("--position is for scripts; leave it out, and place the handle at the surface when asked.")
+        raise InputError(
+            "--position is for scripts; leave it out, and place the handle at the surface when the command asks for it."
+        )
     return _Terminal(encoder_checked)
 
 

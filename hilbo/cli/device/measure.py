@@ -89,7 +89,7 @@ def _advice(damping: float) -> str:
     """Advice on the damping (N·s/m) that studies may assume: the given one rounded down, or to measure again where it
     is not above 0."""
     if damping <= 0:
-        return "the measurement does not tell it from 0: measure again, with the handle free, and plan no study before."
+        return "it does not differ significantly from 0: measure again, with the handle free, and plan no study before."
     from hilbo.identification.motor.commissioning import rounded_down
 
     return f"plan studies with at most {rounded_down(damping):.4g}."
@@ -103,7 +103,7 @@ def characterise(
     depth: Annotated[float, typer.Option(help="Depth of the relaxation test, mm.")] = 5.0,
     load: Annotated[float, typer.Option(help="Force of the creep test, N.")] = 3.0,
     after: Annotated[float, typer.Option(help="Force of the recovery, N.")] = 0.5,
-    hold: Annotated[float, typer.Option(help="How long each is held, s.")] = 3.0,
+    hold: Annotated[float, typer.Option(help="Duration of each constant position or load, s.")] = 3.0,
     rest: Annotated[float, typer.Option(help="Recovery before each test, s.")] = 2.0,
     seed: Annotated[int, seed_option("of the motion")] = 0,
     force: ForceFile = False,
@@ -128,7 +128,7 @@ def characterise(
     with new_file(out, force) as path:
         table.to_csv(path, index=False)
     if ended is not None:
-        raise DeviceError(f"{ended} {out} holds the {ended.repeats} repeats that are whole.")
+        raise DeviceError(f"{ended} {out} contains the {ended.repeats} complete repeats.")
     content = {"file": str(out), "samples": len(table), "repeats": repeats, "damping": damping}
     print_result(content, f"{out}: now  hilbo identify {out} --out results --damping {shortest(damping)}", as_json)
 

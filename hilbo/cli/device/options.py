@@ -48,15 +48,15 @@ class Line(NamedTuple):
     baud: Baud = 921_600
     sim: Sim = None
     study: Annotated[_Path, typer.Option("--study", help="Its damping must not exceed the device's.")] = None
-    damping: Annotated[_Number, typer.Option(help="Damping that is counted on, N.s/m; else the study's.")] = None
-    patience: Annotated[_Number, typer.Option(min=0.001, help="How long an answer may take, s; 0.1 on a line.")] = None
+    damping: Annotated[_Number, typer.Option(help="Assumed damping, N.s/m; by default the study's.")] = None
+    patience: Annotated[_Number, typer.Option(min=0.001, help="Time limit of a reply, s; 0.1 on a line.")] = None
     capture: Annotated[_Path, typer.Option(help="Write the bytes that the device sends to this file.")] = None
 
 
 class Chosen(NamedTuple):
     """One parameter set, by its numbers or from a table; all None: no set."""
 
-    K0: Annotated[_Number, typer.Option("--K0", help="N/mm; else from --K-eff.")] = None
+    K0: Annotated[_Number, typer.Option("--K0", help="N/mm; by default from --K-eff.")] = None
     K1: Annotated[_Number, typer.Option("--K1", help="N/mm.")] = None
     B1: Annotated[_Number, typer.Option("--B1", help="N.s^alpha/mm.")] = None
     alpha: Annotated[_Number, typer.Option("--alpha", help="Order.")] = None
@@ -65,9 +65,9 @@ class Chosen(NamedTuple):
     T: Annotated[_Number, typer.Option("--T", help="Sampling time, s (0.001).")] = None
     memory: Annotated[str | None, typer.Option(help='"short" (N samples) or "full".')] = None
     states: Annotated[int | None, typer.Option(help="Exponentials of full memory (10).")] = None
-    force_limit: Annotated[_Number, typer.Option(help="N; else the device's own.")] = None
+    force_limit: Annotated[_Number, typer.Option(help="N; by default that of the device.")] = None
     sets: Annotated[_Path, typer.Option("--sets", help="Sets table (CSV) to take the set from.")] = None
-    name: Annotated[str | None, typer.Option("--name", help="Which of its sets.")] = None
+    name: Annotated[str | None, typer.Option("--name", help="Set of the table.")] = None
 
 
 def takes(**groups: type) -> Callable:
@@ -147,10 +147,10 @@ def chosen_set(chosen: Chosen, line: Line) -> dict[str, Any] | None:
     if chosen.sets is not None:
         named_sets = sets_of(chosen.sets, line, chosen.K_eff)
         if chosen.name is None and len(named_sets) > 1:
-            raise InputError(f"{chosen.sets}: holds the sets {', '.join(named_sets)}; choose one with --name.")
+            raise InputError(f"{chosen.sets}: contains the sets {', '.join(named_sets)}; choose one with --name.")
         name = next(iter(named_sets)) if chosen.name is None else chosen.name
         if name not in named_sets:
-            raise InputError(f'{chosen.sets}: holds no set "{name}"; it has {", ".join(named_sets)}.')
+            raise InputError(f'{chosen.sets}: contains no set "{name}"; it has {", ".join(named_sets)}.')
         return named_sets[name] | given
     if not given and chosen.K_eff is None:
         return None

@@ -181,7 +181,7 @@ def _press(
         name = names[_KEYS.index(key)]
         view.set = device.send(**sets[name])
         felt.append(name)
-        view.words.append(f'"{name}" is in force')
+        view.words.append(f'"{name}" is active')
     elif key == " " and view.start_after is None and device.state() == State.STOPPED:
         view.start_after = device.link.stops
         if device.status().contact:

@@ -49,14 +49,14 @@ Preset = Annotated[
     str | None,
     typer.Option(
         "--preset",
-        help="Whom the people are drawn from: paper, paper-individuals, or paper-01 to paper-30; by default what the"
-        " study states in [simulation].",
+        help="Simulated population: paper, paper-individuals, or paper-01 to paper-30; by default that of [simulation]"
+        " in the study file.",
     ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace an existing results folder.")]
 ForceFile = Annotated[bool, typer.Option("--force", help="Replace an existing file.")]
 Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")]
-JsonToo = Annotated[bool, typer.Option("--json", help="Print what is said as JSON on stdout.")]
+JsonToo = Annotated[bool, typer.Option("--json", help="Print the output as JSON on stdout.")]
 
 PARTS = ("video-quality", "simulated-memory-foam")
 _EVERY = 10.0  # s

@@ -55,7 +55,7 @@ def _check_private(path: Path, what: str) -> None:
     if os.path.lexists(path) and not is_private(path):
         raise DeviceError(
             f"{path}: {what} is not run, since this belongs to, or may be changed by, another user; delete it, or set"
-            " XDG_CACHE_HOME to a folder of yours."
+            " XDG_CACHE_HOME to another folder."
         )
 
 
@@ -68,8 +68,7 @@ def _build(program: Path, what: str, command: Sequence[str], root: Path) -> None
         folder = Path(tempfile.mkdtemp(prefix="build-", dir=program.parent))
     except OSError as error:
         raise DeviceError(
-            f"{program.parent}: {what} cannot be built there ({error.strerror}); set XDG_CACHE_HOME to a folder of"
-            " yours."
+            f"{program.parent}: {what} cannot be built there ({error.strerror}); set XDG_CACHE_HOME to another folder."
         ) from error
     try:
         made = folder / program.name

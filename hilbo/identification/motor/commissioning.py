@@ -296,7 +296,7 @@ def _heaviest_set(device: Renderer) -> list[str]:
     try:
         device.send(K0=0.0, K1=K1, B1=B1, alpha=alpha, N=taps, T=device.tick_s, wait=_WAITS)
     except RefusalError as error:
-        return [f"The delay was measured without a set in force, whose ticks take longer: {error}"]
+        return [f"The delay was measured without an active set, with which ticks take longer: {error}"]
     return []
 
 

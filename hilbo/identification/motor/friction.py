@@ -124,8 +124,8 @@ def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
     periods, period = np.unique([s.period for s in sweeps], return_inverse=True)
     if periods.size < _FEWEST or np.unique(np.abs(values[:, 1]).round(0)).size < 2:
         raise InputError(
-            f"There are {periods.size} periods of sweeps; at least {_FEWEST}, at two speeds or more, tell damping from"
-            " friction."
+            f"There are {periods.size} periods of sweeps; at least {_FEWEST}, at two speeds or more, are needed"
+            " to distinguish damping from friction."
         )
     # N = kg m/s^2 + (N s/m) m/s + N + N, from mm/s^2 and mm/s
     terms = np.stack([values[:, 2] / 1e3, values[:, 1] / 1e3, np.sign(values[:, 1]), np.ones(len(values))], axis=1)

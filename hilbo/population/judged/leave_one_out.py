@@ -152,7 +152,7 @@ def left_out_by(
     """
     people = trials.mask.shape[0]
     if people < 3:
-        raise InputError(f"leave_one_out: {people} people; at least three are needed, of whom two are left each time.")
+        raise InputError(f"leave_one_out: {people} participants; cross-validation needs at least three.")
     x, mask, q = np.asarray(trials.x), np.asarray(trials.mask), np.asarray(trials.q)
     persons, categories, rows, logs, maps = [], [], [], [], []
     for group in np.arange(people)[:, None] if groups is None else groups:

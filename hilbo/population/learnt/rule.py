@@ -176,7 +176,7 @@ def learn(
     A search that fails does not raise: read `converged`. Raises `InputError` without responses.
     """
     if not np.asarray(trials.mask).any():
-        raise InputError(f"{recipe.name}: nobody gave an answer; at least one person's answers are needed.")
+        raise InputError(f"{recipe.name}: there are no responses; at least one participant's are needed.")
     answers = tallied(trials, categories, 0 if near is None else near.weights.shape[1])
     start = medians(answers, stated, recipe.priors, KERNELS[recipe.kernel])
     common = frozenset(start) - {"widths"}
@@ -195,7 +195,7 @@ def not_learnt(trials: Trials, categories: int, stated: Stated = NOTHING, recipe
     Arguments, and the error raised without responses, as for `learn`; all people have the same widths.
     """
     if not np.asarray(trials.mask).any():
-        raise InputError(f"{recipe.name}: nobody gave an answer; at least one person's answers are needed.")
+        raise InputError(f"{recipe.name}: there are no responses; at least one participant's are needed.")
     answers = tallied(trials, categories)
     search, problem = first_search(
         medians(answers, stated, recipe.priors, KERNELS[recipe.kernel]), answers, stated, recipe

@@ -113,7 +113,7 @@ def of_people(trials: Trials) -> Trials:
     """
     mask = np.asarray(trials.mask)
     if not mask.any():
-        raise InputError("hierarchical: nobody gave an answer; at least one person's answers are needed.")
+        raise InputError("hierarchical: there are no responses; at least one participant's are needed.")
     person = np.broadcast_to(np.arange(len(mask))[:, None], mask.shape)[mask].astype(np.asarray(trials.x).dtype)
     return Trials.from_arrays(
         np.concatenate([np.asarray(trials.x)[mask], person[:, None]], axis=1), np.asarray(trials.q)[mask]

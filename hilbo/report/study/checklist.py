@@ -39,9 +39,9 @@ def checklist(analysis: Analysis, content: dict[str, Any], validated: bool) -> l
     validation session.
     """
     return [
-        Item("Goal", "", f"{_OPEN}what is to be found out, and why by a Bayesian analysis."),
+        Item("Goal", "", f"{_OPEN}the aim of the study, and the reason for a Bayesian analysis."),
         Item("Data", _data(analysis), ""),
-        Item("Model and prior", _model(analysis), f"{_OPEN}why these hyperparameters are plausible beforehand."),
+        Item("Model and prior", _model(analysis), f"{_OPEN}justification of the hyperparameters."),
         Item("Prior prediction", _prior(analysis), ""),
         Item("Computation", _computation(analysis, content), ""),
         Item("Posterior", _posterior(analysis, content), ""),
@@ -51,8 +51,8 @@ def checklist(analysis: Analysis, content: dict[str, Any], validated: bool) -> l
         Item(
             "Reproducibility",
             f"study {content['study']}, seed {content['seed']}, hilbo {content['versions']['hilbo']}; dictionary.csv"
-            " explains every column, map.nc and inference.nc hold map and posterior.",
-            f"{_OPEN}where study file, tables and logs can be had.",
+            " explains every column, map.nc and inference.nc contain map and posterior.",
+            f"{_OPEN}availability of study file, tables and logs.",
         ),
     ]
 
@@ -120,16 +120,16 @@ def _prediction(content, validated):
     if check is None:
         return "Too few participants to leave one out."
     costs = check["negative_log_density"]
-    again = "Validation sessions asked people again." if validated else "Nobody was asked again."
+    again = "There were validation sessions." if validated else "There were no validation sessions."
     return (
-        f"Leave-one-participant-out: {costs['map']:.3f} nats an answer by this map and the participant's earlier"
-        f" answers, {costs['constant']['cost']:.3f} by the same shares everywhere. {again}"
+        f"Leave-one-participant-out: {costs['map']:.3f} nats per response by this map and the participant's earlier"
+        f" responses, {costs['constant']['cost']:.3f} by constant proportions. {again}"
     )
 
 
 def _decisions():
     """The line on decisions, which is left to the authors."""
-    return f"{_OPEN}what is decided by these results, by which bound, and whether it was set before."
+    return f"{_OPEN}the decisions based on these results, their bounds, and whether they were set in advance."
 
 
 def _sensitivity(content):
@@ -138,7 +138,7 @@ def _sensitivity(content):
     if "other_inference" in content:
         other = content["other_inference"]
         parts.append(f"inference by {other['inference']} by {percent(other['nrmse'], 1)}")
-    return f"Of the search ranges: {'; '.join(parts)}; other rules stand among the alternative estimates."
+    return f"Of the search ranges: {'; '.join(parts)}; other methods are among the alternative estimates."
 
 
 def _each(values: Any) -> str:

@@ -187,7 +187,7 @@ def _population(results):
         )
     yield _likeliest(analysis)
     if results.validated is None:
-        yield Evidence("inconclusive", "No validation session asked people again.")
+        yield Evidence("inconclusive", "There are no validation sessions.")
         return
     yield from _validation(results.validated, study)
 
@@ -253,7 +253,7 @@ def _convergence(results):
     analysis = results.analysis
     progress = analysis.progress
     if len(progress.counts) <= 2 or not progress.splits:
-        yield Evidence("inconclusive", "It takes several participants and trials to say.")
+        yield Evidence("inconclusive", "This needs several participants and trials.")
         return
     how = how_aggregated(analysis.aggregate.map)
     how = f" (aggregated {how})" if how else ""
@@ -264,10 +264,10 @@ def _convergence(results):
     farther = _difference(100 * progress.individual_to_half[row] - half)
     yield Evidence(
         farther.side,
-        f"After {progress.counts[row]} trials the optimum of one half of the people{how} is {half:.0f} % (NRMSE,"
+        f"After {progress.counts[row]} trials the optimum of one half of the participants{how} is {half:.0f} % (NRMSE,"
         f" median of {progress.splits} random halves) from that of the other half after all trials, and individual"
         f" optima are {individual:.0f} % from it, farther by {farther} on average (supports: an interval above 0);"
-        f" after all trials the halves are {end:.0f} % apart.",
+        f" after all trials the distance between the halves is {end:.0f} %.",
     )
     if results.reference is not None:
         miss = [
@@ -276,7 +276,7 @@ def _convergence(results):
         ]
         yield Evidence(
             "supports" if miss[0] <= miss[1] + _NEAR else "contradicts",
-            f"The optimum of everybody's first {progress.counts[row]} answers is {100 * miss[0]:.1f} % from"
+            f"The optimum of the first {progress.counts[row]} trials is {100 * miss[0]:.1f} % from"
             f" {results.reference.name}, that of all {100 * miss[1]:.1f} %{how}"
             f" (supports: at most {100 * _NEAR:.0f} % more).",
         )

@@ -83,7 +83,7 @@ def write_study(
     content = _content(folder, contents, claims, seed)
     content["people"] = None if people is None else described(people, _everybody(folder))
     write_result(content, out)
-    say("the page")
+    say("writing the page")
     page = _page(folder, content, sections, claims, comparison)
     (out / "report.html").write_text(page, encoding="utf-8")
     return content

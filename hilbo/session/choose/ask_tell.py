@@ -176,7 +176,7 @@ class Session:
         """The optimum of the posterior, for the highest response its largest mean, in the form of `ask`; computed with
         a fit. Raises `InputError` before the first answer, when the prior mean is the same everywhere."""
         if not len(self.answers):
-            raise InputError("Session: there are no answers yet, and so no best rendering; tell one first.")
+            raise InputError("Session: there are no responses yet, hence no best stimulus; add one with tell() first.")
         return self._named(self.step.best(self.posterior()))
 
 

@@ -80,7 +80,7 @@ class LoggedSession:
         """
         trial = self.state.pending
         if trial is None:
-            raise InputError("nothing has been asked; call ask() first.")
+            raise InputError("there is no pending trial; call ask() first.")
         asks = protocol_of(self.state.study, self.state.header.blocks[trial.block]).asks
         values = {asks[0]: response} | others
         event = live.answer(self.state, trial.id, f"script-{trial.id}", values, time.time(), felt=False)

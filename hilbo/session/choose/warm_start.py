@@ -105,7 +105,7 @@ def read_warm_start(path: str | os.PathLike, study: Study, seed: int = 0, share:
 
     if study.goal.is_between and RULES[study.rule].learns:
         raise InputError(
-            f'{path}: a map by the rule "{study.rule}" has learnt thresholds, which it does not hold, and the goal'
+            f'{path}: a map by the rule "{study.rule}" has learnt thresholds, which it does not contain, and the goal'
             f' "{study.goal_label}" is between two of them; start without the map.'
         )
     grid = read_map(path, study)

@@ -52,7 +52,7 @@ def read_sessions(
     """
     paths = log_paths(folder, note)
     if not paths:
-        raise InputError(f"{folder}: holds no session logs (*.session.jsonl); check the path.")
+        raise InputError(f"{folder}: contains no session logs (*.session.jsonl); check the path.")
     sessions: dict[Path, LiveSession] = {}
     dry = 0
     for path in paths:
@@ -61,7 +61,7 @@ def read_sessions(
         if not state.header.dry_run:
             sessions[path] = state
     if not sessions:
-        raise InputError(f"{folder}: holds nothing but dry runs, in which nobody took part.")
+        raise InputError(f"{folder}: contains only dry runs, without a participant.")
     if dry:
         note(f"{folder}: {'1 dry run is' if dry == 1 else f'{dry} dry runs are'} left out.")
     _check_once(sessions)
@@ -224,7 +224,7 @@ def log_cells(
     """
     table = trials_table(read_sessions(folder, study, note))
     if table.empty:
-        raise InputError(f"{folder}: its sessions hold no answers yet; nothing can be aggregated.")
+        raise InputError(f"{folder}: its sessions have no responses yet; nothing can be aggregated.")
     return [cells_of(table)]
 
 

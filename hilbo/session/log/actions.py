@@ -105,7 +105,7 @@ def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> E
         raise RefusedError("bad-answer", f"trial {trial} has {len(steps)} steps, none with the number {step}.")
     show = steps[step][0]
     if on and state.study.stimulus is not None and show in pending.renderings and show not in pending.confirmed:
-        raise RefusedError("unconfirmed", f'nobody has confirmed that side "{show}" of trial {trial} is presented.')
+        raise RefusedError("unconfirmed", f'it is not confirmed that side "{show}" of trial {trial} is presented.')
     return _event(state, "stimulus", at, id=trial, step=step, show=show, on=bool(on))
 
 
@@ -328,9 +328,7 @@ def _event(state: LiveSession, kind: str, at: float, **data: Any) -> Event:
 def _text(text: str) -> str:
     """Return a text unchanged. Raises RefusedError for one that a spreadsheet would run as a formula."""
     if runs_in_a_spreadsheet(text):
-        raise RefusedError(
-            "bad-answer", f'the text "{text[:40]}" holds what a spreadsheet would run as a formula; write it otherwise.'
-        )
+        raise RefusedError("bad-answer", f'the text "{text[:40]}" contains a formula for spreadsheets; change it.')
     return text
 
 

@@ -36,9 +36,11 @@ def own_study(study: StudyFile, header: Header) -> StudyFile:
     try:
         own = study.stored(header.study_tables)
     except InputError as error:
-        raise InputError(f"its first line holds no whole study file ({error}); restore the log from a copy.") from error
+        raise InputError(
+            f"its first line has no complete study file ({error}); restore the log from a copy."
+        ) from error
     if own.hash != header.study:
-        raise InputError("its first line holds a study file that does not fit its hash; restore the log from a copy.")
+        raise InputError("its first line has a study file that does not fit its hash; restore the log from a copy.")
     keys: list[str] = []
     for material in dict.fromkeys(block.material for block in header.blocks):
         keys += study_of(study, material).changes_of_meaning(study_of(own, material))
@@ -57,7 +59,7 @@ def check_header(study: StudyFile, header: Header) -> None:
         raise InputError(f"the session's header is of schema {header.schema}; this hilbo reads {SCHEMA}.")
     person = header.participant
     if not 0 < len(person) <= _LABEL or not person.isprintable() or any(mark in person for mark in "/\\"):
-        raise InputError(f"the session's participant is \"{person[:_LABEL]}\", which is nobody's id.")
+        raise InputError(f'the session\'s participant is "{person[:_LABEL]}", which is not a valid id.')
     check_label(header.session)
     if not 0 <= header.seed < 2**63:
         raise InputError(f"the session's seed is {header.seed}; it must be a whole number from 0.")
@@ -67,7 +69,7 @@ def check_header(study: StudyFile, header: Header) -> None:
         _check_block(study, header, block, f"block {number}")
     for name, values in header.sets.items():
         if not all(math.isfinite(value) for value in values.values()):
-            raise InputError(f'the set "{name}" of the session holds what is no finite number.')
+            raise InputError(f'the set "{name}" of the session has a value that is not a finite number.')
 
 
 def check_label(label: str) -> None:

@@ -96,7 +96,7 @@ def read_lines(content: bytes, path: str | os.PathLike) -> Read:
             events.append(Event(seq=raw.seq, kind=raw.kind, time=raw.time, data=raw.data))
         good.append(line)
     if header is None:
-        raise InputError(f"{path}: holds no session, it has no whole first line; begin it without --resume.")
+        raise InputError(f"{path}: contains no session, it has no complete first line; begin it without --resume.")
     return Read(header, events, good, dropped)
 
 

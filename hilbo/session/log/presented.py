@@ -27,7 +27,7 @@ def check_confirmed(study: StudyFile, asked: Mapping[str, float], values: Mappin
     for name in _derived(study) & set(values):
         wanted = asked.get(name, math.nan)
         if not abs(values[name] - wanted) <= _EXACT * abs(wanted):
-            raise RefusedError("off", f"{name} is confirmed as {values[name]:g}, and {wanted:g} was asked for.")
+            raise RefusedError("off", f"{name} is confirmed as {values[name]:g}, and {wanted:g} was requested.")
     for parameter in study.space.parameters:
         value, wanted = values[parameter.name], asked[parameter.name]
         most = study.stimulus.off_by(parameter, wanted)
@@ -35,11 +35,11 @@ def check_confirmed(study: StudyFile, asked: Mapping[str, float], values: Mappin
             raise RefusedError("bad-answer", f"{parameter.name} is confirmed as {value}, which is no number.")
         if parameter.levels and value != wanted:
             shown, other = parameter.shown(value), parameter.shown(wanted)
-            raise RefusedError("off", f"{parameter.name} is confirmed as {shown}, and {other} was asked for.")
+            raise RefusedError("off", f"{parameter.name} is confirmed as {shown}, and {other} was requested.")
         if abs(value - wanted) > most:
             raise RefusedError(
                 "off",
-                f"{parameter.name} is confirmed as {value:g}, {wanted:g} was asked for, and it may be off by {most:g}"
+                f"{parameter.name} is confirmed as {value:g}, {wanted:g} was requested, and the tolerance is {most:g}"
                 f" {parameter.unit}".rstrip()
                 + "; round less, or raise the study's tolerance.",
             )

@@ -40,9 +40,7 @@ def _read(path: str | os.PathLike) -> tuple[People, str]:
             person = {key: value.strip() for key, value in zip(table.header, row, strict=True)}
             _check(person, f"{path}:{line}")
             if person["participant"] in people:
-                raise InputError(
-                    f"{path}:{line}: participant {person['participant']} stands there twice; keep one row."
-                )
+                raise InputError(f"{path}:{line}: participant {person['participant']} is there twice; remove one row.")
             people[person["participant"]] = person
     return people, table.delimiter
 
@@ -62,9 +60,7 @@ def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
         with locked_folder(place.parent):
             people, delimiter = _read(path) if place.exists() else ({}, ",")
             if person["participant"] in people:
-                raise InputError(
-                    f"{path}: participant {person['participant']} stands there already; choose another id."
-                )
+                raise InputError(f"{path}: participant {person['participant']} is there already; choose another id.")
             if alike := but_for_case([*people, person["participant"]]):
                 raise InputError(f"{path}: {alike} differ in capitals only; choose another id.")
             people[person["participant"]] = person
@@ -94,7 +90,7 @@ def check_consent(people: People, participant: str, protocol_number: str = "") -
     row = people[participant]
     for column in ("consent_time", "protocol_number"):
         if not row[column]:
-            raise InputError(f"participant {participant} has no {column}; no trial may begin before it stands there.")
+            raise InputError(f"participant {participant} has no {column}; no trial may begin without it.")
     _check_past(row, f"participant {participant}")
     if protocol_number and row["protocol_number"] != protocol_number:
         raise InputError(
@@ -131,7 +127,7 @@ def _check_past(row: Mapping[str, str], place: str) -> None:
         return
     consent = datetime.datetime.fromisoformat(row["consent_time"])
     if consent > datetime.datetime.now(consent.tzinfo) + datetime.timedelta(days=1):
-        raise InputError(f"{place}: consent_time is {row['consent_time']}, which is to come; write when they agreed.")
+        raise InputError(f"{place}: consent_time is {row['consent_time']}, in the future; write the time of consent.")
 
 
 def _write(path: Path, people: People, delimiter: str) -> None:

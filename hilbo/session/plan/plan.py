@@ -135,7 +135,7 @@ def planned_header(plan: Plan, study: StudyFile, participant: str, **others: Any
     if participant not in rows:
         raise InputError(
             f'participant "{participant}" is not in the plan, which has {len(rows)}, {min(rows)} to {max(rows)}; add'
-            " them by a new plan, or reissue the row of somebody who dropped out."
+            " them by a new plan, or reissue the row of a drop-out."
         )
     now = {"study": study.hash, "language": study.session.language, "plan": plan.hash}
     return replace(_header_of_row(rows[participant]), **now, **others)
@@ -155,7 +155,7 @@ def check_plan(plan: Plan, study: StudyFile) -> None:
     """Raise InputError for a plan of a study in which responses mean something else, or with a row whose header is not
     valid or of another participant."""
     if len(plan.meaning) != len(plan.materials):
-        raise InputError("the plan does not say what responses to each of its materials mean; make a new one.")
+        raise InputError("the plan lacks the meaning of each of its materials; make a new one.")
     for name, planned, meaning in zip(plan.materials, plan.meaning, study.meanings(plan.materials), strict=True):
         if planned != meaning:
             raise InputError(
@@ -165,7 +165,7 @@ def check_plan(plan: Plan, study: StudyFile) -> None:
     for row in plan.participants:
         check_header(study, _header_of_row(row))
         if row.header.participant != row.participant or row.header.study != plan.study:
-            raise InputError(f"the plan's row of {row.participant} has somebody else's session; make a new one.")
+            raise InputError(f"the plan's row of {row.participant} has another participant's session; make a new one.")
 
 
 def reissue(plan: Plan, dropped: str, new: str) -> Plan:
@@ -183,7 +183,9 @@ def reissue(plan: Plan, dropped: str, new: str) -> Plan:
     if dropped in given:
         raise InputError(f'plan: the row of "{dropped}" has been reissued to {given[dropped]}; reissue that one.')
     if plan.source == "individual":
-        raise InputError(f'plan: the sets of "{dropped}" are their own; nobody else can be validated with them.')
+        raise InputError(
+            f'plan: the sets of "{dropped}" are individual; other participants cannot be validated with them.'
+        )
     row = rows[dropped]
     fresh = PlanRow(new, row.order, replace(row.header, participant=new), dropped)
     return hashed(replace(plan, participants=(*plan.participants, fresh), replaces=(*plan.replaces, plan.hash)))
@@ -238,7 +240,5 @@ def _compared(study, person, phase, sets, source, codes, seed):
         pairs = [(prefix + a, prefix + b) for a, b in _PAIRS]
         missing = [name for pair in pairs for name in pair if name not in sets]
         if missing:
-            raise InputError(
-                f'plan: there is no set "{missing[0]}"; participant {person} has no map of their own here.'
-            )
+            raise InputError(f'plan: there is no set "{missing[0]}"; participant {person} has no individual map here.')
     return comparisons(pairs, repeats, seed), list(dict.fromkeys(name for pair in pairs for name in pair))

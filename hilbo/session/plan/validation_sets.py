@@ -45,7 +45,7 @@ def check_participants(results: Iterable[Result], participants: Sequence[str], s
             )
         if source == "individual" and person not in in_map:
             raise InputError(
-                f'plan: participant "{person}" has no map of their own in the results; plan for those who do.'
+                f'plan: participant "{person}" has no individual map in the results; plan for those who have one.'
             )
 
 
@@ -107,7 +107,7 @@ def aggregate_best_sets(study: Study, result: Result) -> NamedSets:
     sets = {"aggregate": of(result.optimum, "the optimum")}
     for person in result.participants:
         if person.optimum is None:
-            raise InputError("plan: the results hold no individuals' optima; aggregate again without --no-individuals.")
+            raise InputError("plan: the results have no individual optima; aggregate again without --no-individuals.")
         sets[f"individual:{person.participant}"] = of(person.optimum, f"the optimum of {person.participant}")
     return sets
 

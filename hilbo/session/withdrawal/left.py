@@ -45,7 +45,7 @@ def left_below(root: Path, participant: str) -> dict[str, str]:
         left |= {str(path): why} if why else {}
     if coded := [path for path in ending(below.files, ".csv", ".parquet", ".json", ".jsonl") if _holds_coded(path)]:
         left[str(root)] = (
-            f"{len(coded)} files below hold renderings from individuals' maps under codes, theirs perhaps among them;"
+            f"{len(coded)} files below contain stimuli from individual maps under codes, theirs perhaps among them;"
             f" the values stay with those who compared them: {', '.join(map(str, coded))}"
         )
     return left
@@ -57,23 +57,23 @@ def _why_left(path: Path, participant: str, ours: bool, owner: str | None) -> st
     `ours`: it is one of hilbo's results; `owner`: participant of the log that it is, None for other files.
     """
     if not ours and owner is None and called_after(path, participant):
-        return "is called after them and is no file that hilbo changes; look at it yourself"
+        return "is called after them and is no file that hilbo changes; inspect it yourself"
     try:
         table = read_table(path) if path.suffix == ".parquet" else None
         if table is None and is_closed(path):
-            return "" if ours else "cannot be searched; if it holds anything of theirs, delete it"
+            return "" if ours else "cannot be searched; if it contains their data, delete it"
         if path.suffix.lower() in _PICTURES:
             return ""
         text, suffix = (read_text(path), path.suffix) if table is None else (_as_csv(table), ".csv")
     except OSError as error:
-        return f"cannot be read ({error.strerror}); if it holds anything of theirs, delete it"
+        return f"cannot be read ({error.strerror}); if it contains their data, delete it"
     if not (word := spelled(text, suffix, participant)):
         return ""
     if owner is not None:
-        return f'is the log of {owner} and holds "{word}"; it is chained, and stays as it is'
+        return f'is the log of {owner} and contains "{word}"; it is chained, and is not changed'
     if not spelled(text, suffix, participant, exact=True):
-        return f'holds "{word}", which may be them; only rows of exactly "{participant}" go; look at it yourself'
-    return "names them and is no file that hilbo changes; look at it yourself"
+        return f'contains "{word}", which may be them; only rows of exactly "{participant}" go; inspect it yourself'
+    return "names them and is no file that hilbo changes; inspect it yourself"
 
 
 def _as_csv(table: Cells) -> str:

@@ -62,9 +62,7 @@ def files_below(root: Path) -> Below:
 
     def refused(error: OSError) -> None:
         """Report a folder that cannot be opened."""
-        below.left[str(error.filename)] = (
-            f"cannot be opened ({error.strerror}); if it holds anything of theirs, delete it"
-        )
+        below.left[str(error.filename)] = f"cannot be opened ({error.strerror}); if it contains their data, delete it"
 
     for place, folders, names in os.walk(root, onerror=refused):
         for name in {*folders, *names} - {LOCK, JOURNAL}:
@@ -84,11 +82,11 @@ def _sort_in(path: Path, inside: Path, below: Below) -> None:
         mode = path.stat().st_mode
     except OSError as error:
         why = "is a link to what cannot be opened" if linked else "cannot be opened"
-        below.left[str(path)] = f"{why} ({error.strerror}); if it leads to anything of theirs, delete that"
+        below.left[str(path)] = f"{why} ({error.strerror}); if it leads to their data, delete that"
         return
     place = Path(os.path.realpath(path)) if linked else path
     if linked and not place.is_relative_to(inside):
-        what = "withdraw them there too" if stat.S_ISDIR(mode) else "if that holds anything of theirs, delete it"
+        what = "withdraw them there too" if stat.S_ISDIR(mode) else "if that contains their data, delete it"
         below.left[str(path)] = f"is a link to {place}, out of this folder, where nothing was looked for; {what}"
     elif stat.S_ISREG(mode):
         below.files.append(path)

@@ -85,7 +85,7 @@ def delete_participant(folder: str | os.PathLike, participant: str, done: Withdr
     if not participant.strip():
         raise InputError("participants delete: give the id of the participant.")
     if not root.is_dir():
-        raise InputError(f"{root}: cannot be opened (no such folder); give the folder that holds everything.")
+        raise InputError(f"{root}: cannot be opened (no such folder); give the folder that contains everything.")
     with locked_folder(root, _PATIENCE, in_withdrawal=True), contextlib.ExitStack() as locks:
         before = _journal(root, participant)
         done.label = before.label
@@ -94,7 +94,7 @@ def delete_participant(folder: str | os.PathLike, participant: str, done: Withdr
             planned = _planned(root, before)
             if not (planned.files or planned.removed or planned.renamed):
                 done.left = left_below(root, participant)
-                also = f"; look at what is LEFT ({', '.join([*done.left][:3])})" if done.left else ""
+                also = f"; inspect the files listed as LEFT ({', '.join([*done.left][:3])})" if done.left else ""
                 raise InputError(
                     f'{root}: nothing of participant "{participant}" was removed{also}; check id and folder.'
                 )
@@ -302,7 +302,7 @@ def _refusals(path: Path, refused: dict[str, str]) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        why = f"could not be changed ({error.strerror or error}); if it holds anything of theirs, delete it"
+        why = f"could not be changed ({error.strerror or error}); if it contains their data, delete it"
         refused[str(path)] = why
 
 

@@ -91,11 +91,11 @@ def analyse(
     """All results of one material. `everybody`: all its participants, before exclusion; `say`: called with a phrase at
     the start of each step; `comparison`: also cross-validate all aggregation methods, which is the slowest step. Raises
     `InputError` if all participants are excluded."""
-    say("consistency, lapses and drift of everybody")
+    say("estimating response quality (consistency, lapses, drift)")
     cohort, people, left_out = included(study, everybody)
     population = _with_learnt(analyse_cohort(study, cohort, seed, say), seed, say)
     study, aggregate = population.study, population.aggregate
-    say("hyperparameters by maximum evidence")
+    say("optimising the hyperparameters (maximum evidence)")
     both = fixed_and_optimised(study, cohort)
     fixed, optimised = _aggregates(both, aggregate, seed)
     say("reading the maps")
@@ -150,7 +150,7 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
         sentences.append(f"One answer only was ever given by {', '.join(one)}: that is no map of where to go.")
     planned = study.file.selection.trials
     if counts.max() < planned:
-        sentences.append(f"The study plans {planned} trials; nobody has given more than {counts.max()}.")
+        sentences.append(f"The study plans {planned} trials; the largest number of responses is {counts.max()}.")
     return tuple(sentences)
 
 
@@ -158,7 +158,7 @@ def _compared(study: Study, aggregate: Aggregate, seed: int, say: Say) -> Conten
     """Comparison of all aggregation methods; None for fewer than three participants with responses."""
     if np.sum(aggregate.cohort.counts() > 0) < FEWEST:
         return None
-    say("comparing the rules of aggregation")
+    say("comparing the aggregation methods")
     return compare(study, aggregate, seed, learns=RULES[study.rule].learns)
 
 
@@ -168,7 +168,7 @@ def _with_learnt(population: CohortResults, seed: int, say: Say) -> CohortResult
     study, aggregate = population.study, population.aggregate
     if RULES[study.rule].learns:
         return population
-    say(f"the same by {RECOMMENDED}")
+    say(f"repeating the analysis with {RECOMMENDED}")
     learns = resolved(that_learns(study), aggregate.cohort)
     assert learns.learnt is not None
     map_ = learnt_map(learns.learnt, aggregate.cohort.trials)
@@ -228,10 +228,7 @@ def _aggregated_otherwise(map_: RuleMap) -> Iterator[str]:
             " last optimum need not be the map's."
         )
     if map_.effects is not None:
-        yield (
-            "Everybody's own optimum, maps of fewer trials and the ends of tolerance intervals take no account of the"
-            " random effect."
-        )
+        yield ("Individual optima, maps of fewer trials and the ends of tolerance intervals ignore the random effect.")
 
 
 def moved_by_evidence(analysis: Analysis) -> float:

@@ -51,7 +51,7 @@ class CohortResults(NamedTuple):
     def progress(self) -> Progress:
         """Optima after fewer trials; waits until they are computed. Raises `InputError` if they were not requested."""
         if self.following is None:
-            raise InputError("CohortResults: the optima after fewer trials were not asked; analyse with whole=True.")
+            raise InputError("CohortResults: the optima after fewer trials were not computed; analyse with whole=True.")
         return self.following.result()
 
 
@@ -73,7 +73,7 @@ def analyse_cohort(
     participants; `individuals`, `count`: as `individuals` and `say` of `aggregate_cohort`.
     """
     if RULES[study.rule].learns:
-        say("learning the hyperparameters from all answers")
+        say("fitting the hyperparameters to all responses")
     study = resolved(study, cohort)
     say(f"fitting {len(cohort.names)} participants ({study.file.name})")
 
@@ -87,7 +87,7 @@ def analyse_cohort(
     if not whole:
         highest = highest_answer(study, aggregate.map, aggregate.optimum.x)
         return CohortResults(study, aggregate, None, seed, None, None, highest)
-    say("the optima after fewer trials")
+    say("computing the convergence over trials")
     beside = ThreadPoolExecutor(1, "progress")
     following = beside.submit(follow, study, aggregate, seed)
     beside.shutdown(wait=False)

@@ -45,7 +45,7 @@ def how_aggregated(map_: RuleMap) -> str:
         return ""
     if rule.exact_only:
         return f"by {rule.pointwise}"
-    return f"by the rule {rule.pointwise} point by point" + (", with the learnt hyperparameters" * rule.learns)
+    return f"by the method {rule.pointwise} point by point" + (", with the learnt hyperparameters" * rule.learns)
 
 
 def rule_warnings(study: Study, aggregate: Any) -> list[str]:
@@ -56,17 +56,17 @@ def rule_warnings(study: Study, aggregate: Any) -> list[str]:
         return []
     low, high = np.asarray(share.interval).tolist()
     words = (
-        f"People differ: of the prior variance they have about {100 * float(share.mean):.0f} % in common (95 %:"
-        f' {100 * low:.0f} to {100 * high:.0f} %), and the rule "{study.rule}" takes that to be 100 %. Its intervals'
+        f"Participants differ: about {100 * float(share.mean):.0f} % (95 % interval {100 * low:.0f} to"
+        f' {100 * high:.0f} %) of the prior variance is shared, but "{study.rule}" assumes 100 %, so its intervals'
         " are too narrow"
     )
     ratio = _sd_ratio(aggregate)
     if ratio is not None and ratio >= _TOO_SURE:
         words += (
-            f": at its optimum its standard deviation is {float(aggregate.optimum.sd):.2f}, that of the rule"
+            f": at the optimum its standard deviation is {float(aggregate.optimum.sd):.2f}, that of"
             f' "hierarchical" {ratio:.1f} times as much'
         )
-    return [words + f'. The rules "{RECOMMENDED}" and "hierarchical" allow for differences.']
+    return [words + f'. Use "{RECOMMENDED}" or "hierarchical".']
 
 
 def _sd_ratio(aggregate: Any) -> float | None:

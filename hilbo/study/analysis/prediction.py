@@ -34,7 +34,9 @@ def predict_table(study: Study, model: Posterior | Aggregate, table: pd.DataFram
     x = _points(study, table)
     if isinstance(model, Posterior):
         if not has_values(model.trials.mask) or model.trials.mask.ndim != 1:
-            raise InputError("predict_table: the posterior holds several people; give one of them, or the Aggregate.")
+            raise InputError(
+                "predict_table: the posterior is of several participants; give one of them, or the Aggregate."
+            )
         mean, variance = model.predict(x)
         chances = model.class_probabilities(x)
     elif isinstance(model, Aggregate):

@@ -144,18 +144,18 @@ def region_sentences(region: Region | None, one_optimum: bool = True) -> list[st
     sentences = []
     if not one_optimum:
         return [
-            "The goal is between other answers, so that many renderings are equally good: with"
-            f" {PROBABILITY:.0%} a best one lies in a region that takes up {region.volume:.0%} of what may be rendered."
+            "The goal is between other responses, so that many stimuli are equally good: their"
+            f" {PROBABILITY:.0%} credible region covers {region.volume:.0%} of the feasible region."
         ]
     if not region.located:
         sentences.append(
-            f"The best rendering is not located: with {PROBABILITY:.0%} it lies in a region that takes up"
-            f" {region.volume:.0%} of what may be rendered. More people or trials would narrow it."
+            f"Inconclusive: the {PROBABILITY:.0%} credible region of the optimum covers {region.volume:.0%} of the"
+            " feasible region. Collect more participants or trials."
         )
     if len(region.hills) > 1 and region.hills[1].probability > _RIVAL:
         first, second = (f"{hill.probability:.0%}" for hill in region.hills[:2])
         sentences.append(
-            f"The map has more than one hill: the best rendering is on the likeliest with {first}, on the next with"
-            f" {second}. Have people compare their tops before one is used."
+            f"The map has more than one mode: the optimum is on the most probable with {first}, on the next with"
+            f" {second}. Compare their maxima in a validation before one is used."
         )
     return sentences

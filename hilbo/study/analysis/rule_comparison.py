@@ -241,24 +241,28 @@ def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Sh
     low, high = (float(end) for end in share.interval)
     differ = float(share.against_one)
     evidence = (
-        "People differ" if differ > SURE else "Nothing says that people differ" if differ < 0 else "People may differ"
+        "Participants differ"
+        if differ > SURE
+        else "There is no evidence that participants differ"
+        if differ < 0
+        else "Participants may differ"
     )
     words = (
-        f"{evidence}: they share {float(share.mean):.2f} of the prior variance (95 % from {low:.2f} to {high:.2f}; log"
-        f" Bayes factor against people who are alike {differ:+.1f}). Of people left out, {best} predicts best"
-        f" ({scored[best]['negative_log_density']:.3f} ± {scored[best]['negative_log_density_error']:.3f} nats an"
-        f" answer; {100 * scored[best]['central_95']:.1f} % of the answers lie in its central 95 %)."
+        f"{evidence}: the shared variance fraction is {float(share.mean):.2f} (95 % from {low:.2f} to {high:.2f}; log"
+        f" Bayes factor for differences {differ:+.1f}). In cross-validation {best} predicts best"
+        f" ({scored[best]['negative_log_density']:.3f} ± {scored[best]['negative_log_density_error']:.3f} nats per"
+        f" response; {100 * scored[best]['central_95']:.1f} % of the responses lie in its central 95 %)."
     )
     tied = [rule for rule, gap in differences(left).items() if rule != best and _near(*gap)]
     if RULES[best].homogeneous and differ > SURE:
-        words += f" No rule is recommended: {best} takes people to be alike, so that its intervals are too narrow."
+        words += f" No method is recommended: {best} assumes identical participants, so its intervals are too narrow."
     elif tied:
-        words += f" No rule is recommended: {', '.join(tied)} predict{'s' * (len(tied) == 1)} as well, within two"
+        words += f" No method is recommended: {', '.join(tied)} predict{'s' * (len(tied) == 1)} as well, within two"
         words += " standard errors of the difference."
     else:
-        words += f" Exploratory, since it is drawn from the answers themselves: use {best}."
+        words += f" Exploratory recommendation, based on the same responses: use {best}."
     if people < 8:
-        words += f" With {people} people differences between rules are hardly told from chance."
+        words += f" With {people} participants differences between methods are hardly distinguishable from chance."
     return words
 
 

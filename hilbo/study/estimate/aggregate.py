@@ -138,7 +138,7 @@ class Aggregate(eqx.Module):
     def individuals(self) -> Optimum:
         """Optimum of each participant, stacked (M). Raises `InputError` if they were not computed."""
         if self.own is None:
-            raise InputError("Aggregate: everybody's own optimum was not sought; aggregate with individuals=True.")
+            raise InputError("Aggregate: individual optima were not computed; aggregate with individuals=True.")
         return self.own
 
     @property

@@ -68,7 +68,7 @@ class Crew(NamedTuple):
         marks = self._exchange("".join(read) or "nothing")
         failed = [str(rank) for rank, mark in enumerate(marks) if not mark.any()]
         if failed:
-            raise AgreedError(f"process {failed[0]} of {self.count} refused its input; its own message says why.")
+            raise AgreedError(f"process {failed[0]} of {self.count} refused its input; its message has the reason.")
         if any((mark != marks[0]).any() for mark in marks):
             raise AgreedError(
                 f"the {self.count} processes read different data or were given different options; start all with the"

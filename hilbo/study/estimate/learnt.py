@@ -143,18 +143,18 @@ def learnt_sentences(study: Study) -> list[str]:
     sentences, people = [], len(learnt.weights)
     if learnt.people < people:
         sentences.append(
-            f"The hyperparameters were learnt from a random sample of {learnt.people:,} of {people:,} people; the map"
-            " uses the answers of all."
+            f"The hyperparameters were learnt from a random sample of {learnt.people:,} of {people:,} participants; the"
+            " map uses the responses of all."
         )
     unknown = [name for name, _, known in _coordinates(study, learnt) if not known]
     if unknown:
         sentences.append(
-            f"Not identified by these answers, so that the prior decides: {', '.join(unknown)} (rule {learnt.recipe})."
+            f"The data do not constrain {', '.join(unknown)}; their values come from the prior ({learnt.recipe})."
         )
     if study.stated.thresholds is not None and study.stated.theta is None:
         sentences.append(
-            "The study states the thresholds and learns theta: lengths that are learnt beside thresholds that do not"
-            " fit the answers mislead; leave gp.thresholds out."
+            "The study specifies the thresholds and learns theta: with thresholds that do not fit the responses, learnt"
+            " length scales are misleading; leave gp.thresholds out."
         )
     if not bool(learnt.converged):
         sentences.append(

@@ -17,7 +17,7 @@ __all__ = ["goal_sentences", "location_notes", "location_sentences", "optimum_se
 
 _AT = 1e-6  # of a range
 _BORDERS = {
-    "passive boundary": ("what the device may render", "on the device"),
+    "passive boundary": ("the passive region of the device", "on the device"),
     "effective damping": ("the study's range of effective damping", "within the range of effective damping"),
 }
 
@@ -72,26 +72,22 @@ def location_sentences(
     """
     edges, sentences = _edges(study, np.asarray(x)), []
     if edges.ends:
-        sentences.append(
-            f"The optimum lies at {' and '.join(edges.ends)}: whether people would like what is beyond is not known"
-            " from this study."
-        )
+        sentences.append(f"The optimum is at {' and '.join(edges.ends)}: values beyond it were not tested.")
     if edges.natural:
-        sentences.append(f"The optimum lies at {' and '.join(edges.natural)}, beyond which nothing exists.")
+        sentences.append(f"The optimum is at {' and '.join(edges.natural)}.")
     if edges.constraints:
         sentences.append(
-            f"The optimum lies on the study's constraint {' and '.join(edges.constraints)}: whether people would like"
-            " what is beyond is not known from this study."
+            f"The optimum is on the study's constraint {' and '.join(edges.constraints)}: values beyond it were not"
+            " tested."
         )
     sentences += [
-        f"The optimum lies at the border of {what}: {name} could not be {way} there."
+        f"The optimum is on the boundary of {what}: {name} could not be {way} there."
         for name, way, (what, _) in edges.border
     ]
     if asked is not None and _extrapolates(sd, asked):
         sentences.append(
             f"The optimum is an extrapolation: the map's standard deviation there, {float(sd):.2g}, is larger than"
-            f" wherever somebody answered ({math.sqrt(float(asked)):.2g} at most). Have people judge it before it is"
-            " used."
+            f" at all tested stimuli ({math.sqrt(float(asked)):.2g} at most). Validate it before it is used."
         )
     return sentences
 
@@ -109,7 +105,7 @@ def location_notes(
     notes += [f"on the constraint {words}" for words in edges.constraints]
     notes += [f"{name} could not be {way} {by}" for name, way, (_, by) in edges.border]
     if asked is not None and _extrapolates(sd, asked):
-        notes.append("an extrapolation: less is known there than wherever somebody answered")
+        notes.append("an extrapolation: its standard deviation is larger than at all tested stimuli")
     return notes
 
 

@@ -105,7 +105,7 @@ def _of_one_kind(table: Any, path: str) -> Any:
         beside, ordered = next((key for key in table if key in _NUMBERS_KEYS), None), table.get("ordered") is True
         if beside is not None:
             lack = "no numbers and no unit" if ordered else "no order and no unit"
-            raise InputError(f"{path}.{beside} stands beside levels, which have {lack}; leave it out.")
+            raise InputError(f"{path}.{beside} is not used with levels, which have {lack}; leave it out.")
         if "correlation" in table and ordered:
             raise InputError(f"{path}.correlation is of unordered levels; leave it out, ordered ones have a length.")
         stray = next((key for key in ("at", "natural_ends") if table.get(key)), None)
@@ -135,9 +135,7 @@ def _with_theta(table: GPTable, parameters: Collection[ParameterTable | LevelsTa
     if table.length is None:
         return table
     if table.theta is not None:
-        raise InputError(
-            "gp.length stands beside theta, which says the same (theta = 1/(2 length^2)); keep one of them."
-        )
+        raise InputError("gp.length and theta are equivalent (theta = 1/(2 length^2)); keep one of them.")
     each = table.length if isinstance(table.length, tuple) else (table.length,)
     theta = tuple(1 / (2 * length**2) for length in each)
     return msgspec.structs.replace(table, theta=theta if isinstance(table.length, tuple) else theta[0], length=None)
@@ -201,7 +199,9 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
     tables.session.check(labels)
     if tables.stimulus is not None:
         if tables.renderer is not None and tables.stimulus.by == "person":
-            raise InputError('stimulus.by is "person" beside renderer; nobody renders a force by hand: leave one out.')
+            raise InputError(
+                'stimulus.by is "person" with a renderer; a person cannot render a force by hand: leave one out.'
+            )
         tables.stimulus.check(parameters)
     if tables.simulation is not None:
         tables.simulation.check(parameters, len(labels), labels.index(goal) if goal else len(labels) - 1)
@@ -209,7 +209,7 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
     column = "" if tables.random_effect is None else tables.random_effect.column
     if column in TRIAL_COLUMNS or column in {p.name for p in parameters} or column.startswith("_"):
         raise InputError(
-            f'random_effect.column is "{column}", which has a meaning of its own; name another column of the'
+            f'random_effect.column is "{column}", which has a fixed meaning; name another column of the'
             " answers' table, such as the clip or the day."
         )
 

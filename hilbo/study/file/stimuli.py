@@ -47,7 +47,7 @@ class StimulusTable(Table, frozen=True):
             if name not in names:
                 raise InputError(f"{path} is of no parameter of the study, those are {', '.join(names)}.")
             if name in levels:
-                raise InputError(f"{path} is of levels, and another level is none that was asked for; leave it out.")
+                raise InputError(f"{path} is of levels, which have no tolerance; leave it out.")
             if not 0 <= value < math.inf:
                 raise InputError(f"{path} is {shown(value)}; it must be a number, 0 or above.")
             if name in shares and value >= 1:

@@ -34,7 +34,7 @@ _ID = re.compile(r"[A-Za-z0-9]([A-Za-z0-9_.-]{0,62}[A-Za-z0-9_-])?")
 _RESERVED = re.compile(r"(?i:con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # by Windows, which keeps no file of this name
 ID_WORDS = (
     'an id has up to 64 letters, digits, "_", "-", ".", begins with a letter or digit, does not end with ".", and is'
-    " neither somebody's name nor one that Windows reserves, such as NUL"
+    " neither a person's name nor one that Windows reserves, such as NUL"
 )
 FORMULA_WORDS = (
     "which a spreadsheet would run as a formula; begin it, and what follows a comma, semicolon or tab in it, with a"

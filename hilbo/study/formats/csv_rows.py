@@ -78,12 +78,12 @@ def check_header(names: Sequence[str], place: str) -> None:
     message."""
     if len(names) > _MOST_COLUMNS:
         raise InputError(
-            f"{place}: has {len(names)} columns; a table has {_MOST_COLUMNS} at most, leave out what is not needed."
+            f"{place}: has {len(names)} columns; a table has {_MOST_COLUMNS} at most, leave out unneeded ones."
         )
     known: set[str] = set()
     again = next((name for name in names if name in known or known.add(name)), None)
     if again is not None:
-        raise InputError(f'{place}: column "{again}" stands there twice; keep one of them.')
+        raise InputError(f'{place}: column "{again}" is there twice; remove one of them.')
 
 
 def say_delimiter(delimiter: str, source: str) -> None:

@@ -30,7 +30,7 @@ def toml(text: str, source: str) -> dict[str, object]:
         line = rest.partition(",")[0] or len(text.splitlines())
         raise InputError(f"{source}:{line}: is not valid TOML ({reason}), fix that line.") from error
     except RecursionError as error:
-        raise InputError(f"{source}: nests lists or tables too deep to be read; take them apart.") from error
+        raise InputError(f"{source}: nests lists or tables too deep to be read; flatten them.") from error
     except ValueError as error:
         line = _line_of_digits(text)
         raise InputError(f"{source}:{line}: has a number of too many digits; write it shorter.") from error
@@ -43,7 +43,7 @@ def check_parsed(raw: object) -> None:
     while pending:
         path, value, depth = pending.pop()
         if depth > _DEEPEST:
-            raise InputError(f"{path} nests lists or tables more than {_DEEPEST} deep; take them apart.")
+            raise InputError(f"{path} nests lists or tables more than {_DEEPEST} deep; flatten them.")
         if isinstance(value, Mapping):
             pending += ((f"{path}.{key}" if path else str(key), part, depth + 1) for key, part in value.items())
         elif isinstance(value, list | tuple):

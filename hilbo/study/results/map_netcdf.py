@@ -145,7 +145,7 @@ def _loaded(path: str | os.PathLike) -> xr.Dataset:
         with xr.open_dataset(path, engine="h5netcdf") as opened:
             for name, variable in opened.variables.items():
                 if variable.size > _LARGEST:
-                    raise ValueError(f"{name} would hold {variable.size} numbers")
+                    raise ValueError(f"{name} would have {variable.size} numbers")
             return opened.load()
 
 

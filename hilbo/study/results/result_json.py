@@ -61,12 +61,12 @@ def read_result(path: str | os.PathLike, study: Study) -> Result:
             " answers again."
         )
     if not result.participants:
-        raise InputError(f"{path}: holds no participants; aggregate the answers again.")
+        raise InputError(f"{path}: contains no participants; aggregate the answers again.")
     names = [person.participant for person in result.participants]
     for name in names:
         check_id(name, source)
     if len(set(names)) < len(names):
-        raise InputError(f"{path}: a participant stands there twice; aggregate the answers again.")
+        raise InputError(f"{path}: a participant is there twice; aggregate the responses again.")
     _check_optima(study, result, source)
     return result
 

@@ -79,8 +79,8 @@ def check_pilot(study: Study, cohort: Cohort) -> None:
         raise InputError("pilot: [gp] has no hyperparameters of parameters with levels; leave out --pilot.")
     if participants < FEWEST:
         raise InputError(
-            f"pilot: {participants} participants gave responses; {FEWEST} or more are needed to say how sure the"
-            " hyperparameters are."
+            f"pilot: {participants} participants gave responses; {FEWEST} or more are needed for intervals"
+            " of the hyperparameters."
         )
 
 

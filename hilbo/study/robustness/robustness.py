@@ -130,7 +130,7 @@ def _check(learn: Sequence[str]) -> None:
     unknown = [name for name in learn if name not in LEARNABLE]
     if unknown or not learn:
         asked = f'"{unknown[0]}"' if unknown else "nothing"
-        raise InputError(f"robustness: asked to learn {asked}; choose from {', '.join(LEARNABLE)}.")
+        raise InputError(f"robustness: cannot learn {asked}; choose from {', '.join(LEARNABLE)}.")
 
 
 def _at(study: Study, aggregate: Aggregate, x: Float[Array, " d"]) -> Optimum:

@@ -57,7 +57,7 @@ def read_sets(
             raise InputError(f"{place}: set_id is empty; name every set.")
         check_text(name, "set_id", place)
         if name in sets:
-            raise InputError(f'{place}: set_id "{name}" stands there already; name every set once.')
+            raise InputError(f'{place}: set_id "{name}" is there already; name every set once.')
         sets[name] = {
             column: _value(column, text, needs, levels, place, comma) for column, text in given.items() if text
         }

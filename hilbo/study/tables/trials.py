@@ -105,7 +105,7 @@ def trial_table(
     if not rows:
         raise InputError(f"{source}: has no rows; a trial table needs at least one answer.")
     if named and material not in named:
-        raise InputError(f'{source}: holds no material "{material}"; it has {", ".join(named)}.')
+        raise InputError(f'{source}: contains no material "{material}"; it has {", ".join(named)}.')
     table = pd.concat(pieces)
     del pieces
     _check_duplicates(table, source)
@@ -268,7 +268,7 @@ def _check_blinded(blinded: pd.Series, study: StudyFile, source: str) -> None:
     if not expected and blinded.any() and not blinded.all():
         row = (~blinded).idxmax()
         raise InputError(
-            f"{place(source, row)}is an unblinded answer, as hilbo try gives, beside others that are blinded; leave"
+            f"{place(source, row)}is an unblinded response, as of hilbo try, among blinded ones; leave"
             " the unblinded ones out."
         )
 
@@ -283,7 +283,7 @@ def _check_duplicates(table: pd.DataFrame, source: str) -> None:
         same = (table[key] == table.loc[row, key]).all(axis=1).idxmax()
         line = "row" if source.endswith(".parquet") or source == FRAME else "line"
         raise InputError(
-            f"{place(source, row)}participant {table.at[row, 'participant']}, trial {table.at[row, 'trial']} stands in"
+            f"{place(source, row)}participant {table.at[row, 'participant']}, trial {table.at[row, 'trial']} is in"
             f" {line} {same} already; each ({', '.join(key)}) may occur once."
         )
 
@@ -298,10 +298,10 @@ def of_material(table: pd.DataFrame, material: str | None, source: str) -> pd.Da
     materials = list(table["material"].unique())
     if material is None and len(materials) > 1:
         raise InputError(
-            f"{source}: holds {len(materials)} materials ({', '.join(materials)}); choose one with --material."
+            f"{source}: contains {len(materials)} materials ({', '.join(materials)}); choose one with --material."
         )
     if material is not None and material not in materials:
-        raise InputError(f'{source}: holds no material "{material}"; it has {", ".join(materials)}.')
+        raise InputError(f'{source}: contains no material "{material}"; it has {", ".join(materials)}.')
     return table if material is None else table[table["material"] == material]
 
 

@@ -79,7 +79,7 @@ def check_validation(
     if "first" in text:
         out["first"] = _chosen(text, "first", (), source)
     nothing = (out["class_a"] == NONE) & (out["class_b"] == NONE) & (out["preferred"] == NONE)
-    refuse(nothing, source, lambda row: "holds no answer; fill in class_a and class_b, or preferred, or leave it out.")
+    refuse(nothing, source, lambda row: "has no response; fill in class_a and class_b, or preferred, or leave it out.")
     _check_duplicates(out, source)
     counts = ~boolean_column(text, "voided", source) & (is_fitted(text["phase"]) if "phase" in text else True)
     flags_of = counted_flags(out[counts], exclude_flags)
@@ -120,9 +120,7 @@ def _check_sets(text: pd.DataFrame, source: str) -> None:
         refuse(
             text[column].isin(_RESERVED),
             source,
-            lambda row, c=column: (
-                f'{c} is "{text.at[row, c]}", which has a meaning of its own; name the set otherwise.'
-            ),
+            lambda row, c=column: f'{c} is "{text.at[row, c]}", which has a fixed meaning; choose another name.',
         )
     same = text["set_a"] == text["set_b"]
     refuse(same, source, lambda row: f'set_a and set_b are both "{text.at[row, "set_a"]}"; compare two sets.')
@@ -135,12 +133,12 @@ def of_material(table: pd.DataFrame, material: str | None, source: str = "valida
     if material is None:
         if len(materials) > 1:
             raise InputError(
-                f"{source}: holds {len(materials)} materials ({', '.join(materials)}); choose one of them."
+                f"{source}: contains {len(materials)} materials ({', '.join(materials)}); choose one of them."
             )
         return table
     if material not in materials:
         has = f"it has {', '.join(materials)}" if materials else 'it has no column "material"'
-        raise InputError(f'{source}: holds no comparisons of material "{material}"; {has}.')
+        raise InputError(f'{source}: contains no comparisons of material "{material}"; {has}.')
     return table[table["material"] == material]
 
 
@@ -198,7 +196,7 @@ def _check_duplicates(table: pd.DataFrame, source: str) -> None:
         again,
         source,
         lambda row: (
-            f"participant {table.at[row, 'participant']}, trial {table.at[row, 'trial']} stands there already;"
+            f"participant {table.at[row, 'participant']}, trial {table.at[row, 'trial']} is there already;"
             f" each ({', '.join(key)}) may occur once."
         ),
     )
