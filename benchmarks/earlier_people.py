@@ -19,7 +19,7 @@ paper-05, ... paper-30) and functions drawn, 100 studies each, every study with 
 at the interval, after 50 and after 100 studies. Earlier people become an option if the lower end of the 95 % interval
 of the gain (regret by learnt-2, all answers) is above 0 for both groups together at 12 and at 24 people, and with
 reversed people the gain is not below 0 by more than its error. --write puts the table into
-docs/methods/which_method.md.
+docs/methods/which_method_tables.md.
 """
 
 import argparse
@@ -69,7 +69,7 @@ def main():
     chosen = options.parse_args()
     rows = Rows(chosen.file)
     if chosen.write:
-        put("methods/which_method.md", "earlier people", table(rows.rows))
+        put("methods/which_method_tables.md", "earlier people", table(rows.rows))
         return
     known = {(row["population"], row["seed"], row["design"]) for row in rows}
     designs = [each + chosen.reversed * REVERSED for each in chosen.design or DESIGNS]

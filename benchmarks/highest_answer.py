@@ -6,7 +6,7 @@
 FILE (JSON Lines) collects a row for each study; a run that was stopped goes on where it was. What has been run is in
 benchmarks/highest_answer.jsonl. All methods have the same responses. learnt-3 was chosen on the presets
 paper-01, paper-04, ... paper-28, seeds 0 to 2; reported are paper-02, paper-05, ... paper-29 and the other populations,
-seeds from 1000. --write puts the table into docs/methods/which_method.md.
+seeds from 1000. --write puts the table into docs/methods/which_method_tables.md.
 """
 
 import argparse
@@ -50,7 +50,7 @@ def main():
     chosen = options.parse_args()
     rows = Rows(chosen.file)
     if chosen.write:
-        put("methods/which_method.md", "highest answer", "\n".join(table(rows.rows)))
+        put("methods/which_method_tables.md", "highest answer", "\n".join(table(rows.rows)))
         return
     known = {(row["population"], row["design"], row["seed"]) for row in rows}
     for seed in range(chosen.first, chosen.first + chosen.studies):

@@ -5,7 +5,8 @@
 
 Studies of the population `paper-individuals` (benchmarks/populations_people.py), sessions of 25 trials. --priors: every
 prior's standard deviation halved and doubled, seeds from 0; how far the optimum moves (NRMSE), and what that does to
-how often new people give the highest answer there. --write puts the tables into docs/methods/which_method.md.
+how often new people give the highest answer there. --write puts the tables into
+docs/methods/which_method_models.md and docs/methods/which_method_tables.md.
 """
 
 import argparse
@@ -14,7 +15,6 @@ import itertools
 import os
 import resource
 import time
-from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[variable] = "1"
@@ -29,6 +29,7 @@ jax.config.update("jax_enable_x64", True)
 import equinox as eqx  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from pages import put  # noqa: E402
 from populations import chance_at  # noqa: E402
 from populations_people import POPULATIONS  # noqa: E402
 
@@ -46,7 +47,6 @@ from hilbo.study.config import Study  # noqa: E402
 from hilbo.study.estimate.learnt import that_learns  # noqa: E402
 from hilbo.study.estimate.optimum import map_optimum  # noqa: E402
 
-PAGE = Path(__file__).parents[1] / "docs" / "methods" / "which_method.md"
 POPULATION = POPULATIONS["paper-individuals"]
 EXACT = 2500  # features: one for each point of 100 people
 CATEGORIES = 3
@@ -61,14 +61,16 @@ def main():
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
     if chosen.priors:
-        name, lines = "priors", sensitivity(RECIPES[chosen.recipe], chosen.seeds)
+        page, name, lines = (
+            "methods/which_method_tables.md",
+            "priors",
+            sensitivity(RECIPES[chosen.recipe], chosen.seeds),
+        )
     else:
-        name, lines = "times", times(chosen.people)
+        page, name, lines = "methods/which_method_models.md", "times", times(chosen.people)
     print("\n".join(lines))
     if chosen.write:
-        before, _, rest = PAGE.read_text().partition(f"<!-- {name} -->")
-        _, _, after = rest.partition("<!-- end -->")
-        PAGE.write_text(f"{before}<!-- {name} -->\n" + "\n".join(lines) + f"\n<!-- end -->{after}")
+        put(page, name, "\n".join(lines))
 
 
 def answers(people, seed):
@@ -125,7 +127,7 @@ def sensitivity(recipe, seeds):
             moved[name, factor].append((100 * np.sqrt(np.mean((other - x) ** 2)), its_value - value))
         print(seed, flush=True)
     lines = [
-        "| prior | sd | optimum moves, median (largest), % of the ranges | change of P(highest) of a new person |",
+        "| prior | sd | optimum moves, median (largest), % of the ranges | change of P(highest) of a new participant |",
         "|---|---|---:|---:|",
     ]
     for (name, factor), rows in moved.items():

@@ -6,7 +6,8 @@
 DATA: the folder with orientation_confidence.csv, tactile_speed.csv, video_quality.csv and touch_video.csv. FILE (JSON
 Lines) collects a row for each fold; an interrupted run resumes. touch_video has 8 folds, the others one for each
 participant. Predictions do not use the participant's own responses. bcm has the kernel, thresholds and noise of
-learnt-2. Errors are clustered by participant. --write puts the table into docs/methods/which_method.md; the rows of all
+learnt-2. Errors are clustered by participant. --write puts the table into
+docs/methods/which_method_tables.md; the rows of all
 folds are in benchmarks/left_out_people.jsonl.
 """
 
@@ -39,10 +40,10 @@ from hilbo.study.config import Study  # noqa: E402
 
 GROUPS = 8
 WORDS = {
-    "orientation": "orientation confidence, 8 people",
-    "speed": "speed of a moving surface under the finger, 9 people",
-    "video": "video quality, 17 people",
-    "touch": "touch in videos, 1,026 people",
+    "orientation": "orientation confidence, 8 participants",
+    "speed": "speed of a moving surface under the finger, 9 participants",
+    "video": "video quality, 17 participants",
+    "touch": "touch in videos, 1,026 participants",
 }
 RULES = ("bcm", LEARNT_2.name, LEARNT_3.name)
 
@@ -56,7 +57,7 @@ def main():
     chosen = options.parse_args()
     rows = Rows(chosen.file)
     if chosen.write:
-        put("methods/which_method.md", "left out", "\n".join(table(rows.rows)))
+        put("methods/which_method_tables.md", "left out", "\n".join(table(rows.rows)))
         return
     known = {(row["data"], row["fold"]) for row in rows}
     for name in chosen.only:

@@ -5,7 +5,7 @@
 
 Each participant is left out and predicted in two ways: from the others' responses alone, and also from the earlier
 ones. FILE (JSON Lines) collects a row for each study; a run that was stopped goes on. --write puts the table into
-docs/methods/which_method.md.
+docs/methods/which_method_tables.md.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def main():
     chosen = options.parse_args()
     rows = Rows(chosen.file)
     if chosen.write:
-        put("methods/which_method.md", "model check", table(list(rows)))
+        put("methods/which_method_tables.md", "model check", table(list(rows)))
         return
     known = {(row["population"], row["seed"]) for row in rows}
     for seed in range(FIRST, FIRST + chosen.studies):
@@ -84,7 +84,7 @@ def one_study(name, seed):
 
 
 def table(rows):
-    heads = ("predicted", "the highest answer", "a share differs", "a quadratic is better", "by two errors")
+    heads = ("predicted", "the highest response", "a proportion differs", "a quadratic is better", "by two errors")
     lines = ["| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(heads) - 1)]
     ways = {"alone": "from the others alone", "in turn": "also from the participant's earlier responses"}
     for way, words in ways.items():

@@ -6,7 +6,7 @@
 Functions, answers and hyperparameters are those of the rule: one function for all by "pooled", a shared one and
 individual ones by "hierarchical" (which learns the share). Each person answers 25 times, seven times at an earlier
 point. FILE (JSON Lines) collects the check of each study; a run that was stopped goes on. --write puts the table into
-docs/methods/which_method.md; what has been run is in benchmarks/model_check_calibrated.jsonl.
+docs/methods/which_method_tables.md; what has been run is in benchmarks/model_check_calibrated.jsonl.
 """
 
 import argparse
@@ -44,7 +44,7 @@ def main():
     chosen = options.parse_args()
     rows = Rows(chosen.file)
     if chosen.write:
-        put("methods/which_method.md", "calibrated check", table(rows.rows))
+        put("methods/which_method_tables.md", "calibrated check", table(rows.rows))
         return
     known = {(row["rule"], row["people"], row["seed"]) for row in rows}
     for people in chosen.people:

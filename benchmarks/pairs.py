@@ -21,7 +21,7 @@ paper-16 and five populations of functions, seed 0, --noise 1.2, the regret of *
 the published method was preferred. Reported: 100 studies of paper-02, paper-03, paper-05, ... paper-30, and 100 of the
 functions drawn, every study with a seed of its own from 1000; half of them at 1.0 and 1.4. Two looks at the interval,
 after 50 and after 100 studies. Two renderings a trial are recommended if the lower end of the 95 % interval of the gain
-at 1.2 is above 0 for both groups. --write puts the table into docs/methods/which_method.md.
+at 1.2 is above 0 for both groups. --write puts the table into docs/methods/which_method_tables.md.
 """
 
 import argparse
@@ -69,7 +69,7 @@ def main():
     chosen = options.parse_args()
     rows = Rows(chosen.file)
     if chosen.write:
-        put("methods/which_method.md", "pairs", table(rows.rows))
+        put("methods/which_method_tables.md", "pairs", table(rows.rows))
         return
     known = {(row["population"], row["seed"], row["design"]) for row in rows}
     designs = [

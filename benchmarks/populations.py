@@ -12,7 +12,7 @@ gives the highest answer at the optimum found than at the best feasible renderin
 0 to 99; what is reported begins at 1000. --regions: of how many studies of each population the region is made,
 which is half of the work. --chance: points by chance in place of sessions. --medians: sessions choose by the medians of
 the recipes' priors, as those of a study file that `hilbo init` writes; else by the paper's hyperparameters. --write
-puts the tables into docs/methods/which_method.md.
+puts the tables into docs/methods/which_method_tables.md.
 """
 
 import argparse
@@ -304,9 +304,9 @@ def write(rows):
     for design, even in EVEN.items():
         part = [row for row in rows if row["design"] == design]
         if part:
-            put("methods/which_method.md", f"populations {design}", tables(part, even))
+            put("methods/which_method_tables.md", f"populations {design}", tables(part, even))
     if any(row["design"] == "24x25" + MEDIANS for row in rows):
-        put("methods/which_method.md", "populations by medians", sessions(rows, "24x25"))
+        put("methods/which_method_tables.md", "populations by medians", sessions(rows, "24x25"))
 
 
 if __name__ == "__main__":

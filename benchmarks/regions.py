@@ -7,7 +7,7 @@ The shared function and everybody's own part are drawn from the recipe's kernel 
 random waves. Lengths, variances and thresholds are drawn anew for each study, so that they are learnt with an error:
 from the priors of learnt-1, whose values leave no category empty in most studies (those of learnt-2 reach from no
 differences at all to noise-free answers). People answer at feasible points drawn evenly. FILE (JSON Lines) collects a
-row for each study. --write puts the table into docs/methods/which_method.md.
+row for each study. --write puts the table into docs/methods/which_method_tables.md.
 """
 
 import argparse
@@ -38,7 +38,7 @@ def main():
     chosen = options.parse_args()
     rows = Rows(chosen.file)
     if chosen.write:
-        put("methods/which_method.md", "regions", table(rows.rows))
+        put("methods/which_method_tables.md", "regions", table(rows.rows))
         return
     known = {(row["design"], row["seed"]) for row in rows}
     for seed in range(chosen.first, chosen.first + chosen.studies):

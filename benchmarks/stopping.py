@@ -9,7 +9,8 @@ ends when it is smaller than a tenth of the feasible set.
 
 Fixed before the first study: the eighth person and the tenth; paper-02, paper-03, paper-05, ... paper-30 and the
 functions drawn in turn, seeds from 1000, 400 studies or half of them. A study may stop if the region after stopping
-holds the best rendering in at least 93 % of the studies. --write puts the table into docs/methods/which_method.md.
+holds the best rendering in at least 93 % of the studies. --write puts the table into
+docs/methods/which_method_tables.md.
 """
 
 import argparse
@@ -50,7 +51,7 @@ def main():
     chosen = options.parse_args()
     rows = Rows(chosen.file)
     if chosen.write:
-        put("methods/which_method.md", "stopping", table(rows.rows))
+        put("methods/which_method_tables.md", "stopping", table(rows.rows))
         return
     known = {(row["population"], row["seed"]) for row in rows}
     for name, seed in scheduled(chosen.studies, chosen.first):

@@ -6,7 +6,7 @@
 Populations *functions* of benchmarks/populations.py, the same answers. Kernel, lengths, variances, noise and thresholds
 are known here; only the functions are not. The optimum is where a new person most probably gives the highest answer.
 The arithmetic is SciPy's on the covariance of all answers (Laplace), none of it hilbo's. FILE (JSON Lines) collects a
-row for each study; a run that was stopped goes on. --write puts the table into docs/methods/which_method.md.
+row for each study; a run that was stopped goes on. --write puts the table into docs/methods/which_method_tables.md.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def main():
     chosen = options.parse_args()
     rows = Rows(chosen.file)
     if chosen.write:
-        put("methods/which_method.md", "true model", table(list(rows)))
+        put("methods/which_method_tables.md", "true model", table(list(rows)))
         return
     known = {(row["population"], row["seed"]) for row in rows}
     for seed in range(FIRST, FIRST + chosen.studies):

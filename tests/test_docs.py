@@ -108,6 +108,15 @@ def test_tables_of_benchmarks_have_their_marks():
         assert text.count(f"<!-- {name} -->\n") == text.count(f"<!-- end of {name} -->") == 1, (page, name)
 
 
+def test_the_choice_of_a_method_is_read_in_five_minutes():
+    """The recommendation first, two figures, and the tables on other pages."""
+    text = (DOCS / "methods" / "which_method.md").read_text(encoding="utf-8")
+    assert len(text.split()) <= 1200
+    assert text.index("| your study | method |") < text.index("## Evidence") < text.index("## Limits")
+    figures = re.findall(r"^!\[.{100,}\]\((which_method-\w+\.svg)\)$", text, re.M)
+    assert len(figures) == 2 and all((DOCS / "methods" / figure).is_file() for figure in figures)
+
+
 def test_a_notebook_becomes_text_and_code(tmp_path, monkeypatch):
     made = script("hooks")
     path = made.ROOT / "notebooks" / "quick_start.py"

@@ -39,7 +39,7 @@ def learnt():
 
 def dense_objective(z, trials, kernel=Matern32, sd=(1.2, 1.2, 2.0, 2.0, 4.0, 2.0)):
     """The log posterior of [log theta (2), log shared, log own, middle, log gap], by the model of all answers at once
-    and the priors as docs/methods/which_method.md states them; learnt-2's, unless others are given."""
+    and the priors as docs/methods/which_method_models.md states them; learnt-2's, unless others are given."""
     theta, shared, own = np.exp(z[:2]), np.exp(z[2]), np.exp(z[3])
     half = 0.5 * np.exp(z[5])
     gp = OrdinalGP(kernel(tuple(theta), shared + own), OrdinalProbit((z[4] - half, z[4] + half), 1.0))

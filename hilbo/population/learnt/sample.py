@@ -1,6 +1,6 @@
 """Hyperparameters of a large population, learnt from a random sample of participants, to bound time and memory.
 
-docs/methods/which_method.md has a table of the shift of the optimum by the size of the sample. The map uses the
+docs/methods/which_method_models.md has a table of the shift of the optimum by the size of the sample. The map uses the
 responses of all participants. Individual widths and sensitivities of participants outside the sample are fitted block
 by block, with the other hyperparameters fixed.
 """

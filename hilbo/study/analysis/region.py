@@ -29,7 +29,7 @@ PROBABILITY = 0.95
 _LOCATED = 0.25  # of the feasible set: a larger region locates nothing
 _RIVAL = 0.2  # of the draws on another hill
 _HYPERPARAMETERS = 16  # draws of them
-_DRAWS = 16 * DRAWS  # fewer scatter over many points, and the region is too small (docs/methods/which_method.md)
+_DRAWS = 16 * DRAWS  # fewer scatter over many points, and the region is too small (docs/methods/which_method_tables.md)
 
 
 class Region(NamedTuple):
