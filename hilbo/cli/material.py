@@ -17,7 +17,7 @@ Memory = Annotated[str, typer.Option(help='"short" (N samples) or "full".')]
 
 
 def identify(
-    table: Annotated[Path, typer.Argument(help="Creep and relaxation tests (CSV or Parquet).", show_default=False)],
+    table: Annotated[Path, typer.Argument(help="Creep and relaxation tests (CSV, text, Parquet).", show_default=False)],
     out: Out,
     material: Annotated[
         str | None, typer.Option(help="Which of the table's materials, or its name if the table has no column for it.")
@@ -39,6 +39,20 @@ def identify(
     model: Annotated[str, typer.Option(help='For moduli: "fosls" or "fractional-maxwell".')] = "fosls",
     weights: Annotated[str | None, typer.Option(help='For moduli: residuals over the "range", or "relative".')] = None,
     longest: Annotated[float | None, typer.Option(help="Use only the first seconds of each test, s.")] = None,
+    test: Annotated[
+        str | None, typer.Option(help='Kind of test of a table without a column "test": relaxation or creep.')
+    ] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option(
+            help='Which column is a quantity, as "force_N=Load"; "force_N=-Load" changes its sign. Repeatable.'
+        ),
+    ] = None,
+    block: Annotated[
+        list[int] | None, typer.Option(help="Number of the block to read from a file of several. Repeatable.")
+    ] = None,
+    area: Annotated[float | None, typer.Option(help="Area of the sample, mm2, for stress and strain.")] = None,
+    gap: Annotated[float | None, typer.Option(help="Thickness of the sample, mm, for stress and strain.")] = None,
     seed: Annotated[int, seed_option("of bootstrap resamples")] = 0,
     force: Force = False,
     as_json: Json = False,
@@ -55,6 +69,9 @@ def identify(
     _positive("T", period)
     _positive("damping", damping)
     _positive("longest", longest)
+    _positive("area", area)
+    _positive("gap", gap)
+    check_choice("test", test, (None, "relaxation", "creep"))
     instrument = {"lag": _number("lag", lag, ("fit",)), "corner": _number("corner", corner, ("fit", "none", "auto"))}
     with results(out, force) as folder, progress() as say:
         say("reading")
@@ -62,15 +79,20 @@ def identify(
         from hilbo.identification import characterise, memory_selection
         from hilbo.identification.fitting import MEASURED
         from hilbo.identification.material_tables import read_material
+        from hilbo.identification.tables.layout import Layout
         from hilbo.report import material as report_material
 
-        measurements = read_material(table, material, begin=begin, only=only, longest=longest)
+        layout = Layout(test, tuple(block or ()), tuple(column or ()), area, gap)
+        measurements = read_material(table, material, begin=begin, only=only, longest=longest, layout=layout)
         measured = measurements.tests[0].kind in MEASURED
         chosen = _model(measured, model, weights, taps, period, memory, instrument)
         choices = memory_selection.CHOICES if measured and compare else ()
-        result = characterise.characterise(
-            measurements.tests, chosen, seed, choices, say, find_filter=instrument["corner"] == "auto"
-        )
+        try:
+            result = characterise.characterise(
+                measurements.tests, chosen, seed, choices, say, find_filter=instrument["corner"] == "auto"
+            )
+        except InputError as error:
+            raise InputError(f"{table}: {error}") from None
         say("drawing figures and writing the report")
         content = report_material.identification_result(
             table.name, measurements.tests, result, measurements.stiffness_unit, measurements.notes, damping

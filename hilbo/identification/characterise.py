@@ -23,7 +23,7 @@ from hilbo.identification.memory_selection import Row, select_memory
 from hilbo.identification.misfit import filter_score
 from hilbo.identification.residual_noise import noise
 from hilbo.identification.sampled import Sampled
-from hilbo.identification.sentences import sentences
+from hilbo.identification.sentences import sentences, stiffening
 
 __all__ = ["Characterisation", "Estimate", "characterise"]
 
@@ -65,13 +65,16 @@ def characterise(
     `model`: a `fitting.Model`; `seed` of the bootstrap and of quantiles. `choices`: memory lengths (None: full memory)
     to compare, in further fits; empty: no comparison. `say` receives the name of each step for progress output.
     `find_filter`: a `Sampled` with `lag="fit"` and no filter is fitted with one if the residuals indicate it
-    (`misfit`). The fit in the result is that of the model finally used. Raises `InputError` as `fitting.fit`, and for
-    `choices` with a model that is not sampled, which has no memory.
+    (`misfit`). The fit in the result is that of the model finally used. Raises `InputError` as `fitting.fit`, for tests
+    whose best fit has a K1 below 0, and for `choices` with a model that is not sampled, which has no memory.
     """
     if choices and not isinstance(model, Sampled):
         raise InputError("choices are memory lengths, which only a sampled model has; leave them out for moduli.")
     say("fitting")
     best_fit, sides = _fitted(tests, model, say, find_filter)
+    K1 = best_fit.parameters().get("K1", 0.0) if isinstance(best_fit.model, Sampled) else 0.0
+    if K1 < 0:
+        raise InputError(stiffening(K1, tests))
     sampling = intervals.spread(best_fit)
     boot = None
     if min(test.repeats for test in tests) >= intervals.FEWEST_REPEATS:

@@ -85,7 +85,7 @@ class Test(eqx.Module):
             if opposed:
                 which = f" in repeat {repeat} of {self.repeats} (counted from 1)" if self.repeats > 1 else ""
                 fault = f"The {self.kind} test has position and force of opposite signs{which}"
-                raise InputError(f"{fault}; multiply one of them by -1.")
+                raise InputError(f'{fault}; multiply one of them by -1, in a file by --column "force=-COLUMN".')
 
     @property
     def repeats(self) -> int:

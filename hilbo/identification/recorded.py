@@ -10,6 +10,7 @@ from hilbo.identification.fitting import Test
 __all__ = [
     "AROUND",
     "damping_radius",
+    "hold_at_end",
     "interpolated",
     "local_line",
     "lost_contact",
@@ -20,6 +21,7 @@ __all__ = [
 ]
 
 AROUND = 3  # half-width (rows) of the local line
+_HELD, _FEWEST_HELD = 0.02, 4
 _GAP = 1.5  # median time steps, above which a step is a gap
 
 
@@ -87,6 +89,17 @@ def secant(test: Test) -> float:
     """Secant stiffness: largest force / largest position, N/mm."""
     force, position = _force_and_position(test)
     return float(np.max(np.abs(force)) / np.max(np.abs(position)))
+
+
+def hold_at_end(test: Test) -> slice | None:
+    """The last rows of a recorded test, over which its input differs from the last one by 2 % of its largest at most;
+    None if there are fewer than four."""
+    applied = test.input.mean(axis=0) if test.input is not None else np.zeros(0)
+    if not applied.size:
+        return None
+    away = np.flatnonzero(np.abs(applied - applied[-1]) > _HELD * np.max(np.abs(applied)))
+    start = int(away[-1]) + 1 if away.size else 0
+    return slice(start, None) if applied.size - start >= _FEWEST_HELD else None
 
 
 def transform_length(count: int) -> int:

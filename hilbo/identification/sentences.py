@@ -11,10 +11,10 @@ from hilbo.identification.fitting import Fit, Test
 from hilbo.identification.instrument import is_fitted_in_force
 from hilbo.identification.intervals import FEWEST_REPEATS, Intervals, Spread
 from hilbo.identification.misfit import coarse_kinds, moved_between_rows
-from hilbo.identification.recorded import lost_contact
+from hilbo.identification.recorded import hold_at_end, lost_contact
 from hilbo.identification.residual_noise import DRIFTS
 
-__all__ = ["recording", "sentences"]
+__all__ = ["recording", "sentences", "stiffening"]
 
 _UNRELATED = 3.0  # times the noise of the repeats, above which the model has a systematic error
 _WIDE, _TICKS = 5.0, 10.0  # multiples of the median time step, and of T, above which a step is a gap
@@ -143,6 +143,39 @@ def recording(test: Test, T: float) -> Iterator[str]:
             f" {names[1]}; unless that is noise, values and intervals are wrong: tare it (subtract that from every"
             f" {names[0]})."
         )
+
+
+def stiffening(K1: float, tests: Sequence[Test]) -> str:
+    """Sentence on tests that are fitted best by a `K1` (N/mm) below 0: what they do while the input is held, likely
+    causes, and what to do."""
+    changes = ", and ".join(change for test in tests if (change := _wrong_way(test)))
+    return (
+        f"The best fit has K1 = {K1:.3g} N/mm, below 0, which no viscoelastic material has"
+        f"{f' ({changes})' if changes else ''}; check the columns and their signs, that the indenter stands still"
+        " during the hold, and that the sensor does not drift; leave out the rows in which it does, or record again."
+    )
+
+
+def _wrong_way(test: Test) -> str:
+    """What the output does against the direction of relaxation or creep while the input is held at the end of a test;
+    "" if it does not."""
+    hold = hold_at_end(test)
+    if test.input is None or hold is None:
+        return ""
+    time, applied, measured = test.time[hold], test.input.mean(axis=0)[hold], test.output.mean(axis=0)[hold]
+    few = max(1, measured.size // 10)
+    first, last = float(measured[:few].mean()), float(measured[-few:].mean())
+    grows = (last - first) * float(np.sign(applied[-1])) > 0
+    if grows != (test.kind == "relaxation") or first == last:
+        return ""
+    name, unit, other, of_other = ("force", "N", "position", "mm")
+    if test.kind == "creep":
+        name, unit, other, of_other = other, of_other, name, unit
+    way = "rises" if last > first else "falls"
+    return (
+        f"the {name} of the {test.kind} test {way} from {first:.4g} to {last:.4g} {unit}"
+        f" while its {other} is held ({applied[0]:.4g} to {applied[-1]:.4g} {of_other}, {time[0]:g} to {time[-1]:g} s)"
+    )
 
 
 def _above_scatter(values: np.ndarray) -> bool:

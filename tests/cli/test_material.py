@@ -1,6 +1,7 @@
 """`hilbo identify` and `hilbo passivity` as a user types them."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import run
+from instrument_tables import AREA, CASES, GAP, PLAIN
 from material import FOAM, foam_tests
 
 from hilbo.identification.fitting import Test
@@ -105,6 +107,42 @@ def test_opposite_signs_end_with_2_and_write_nothing(capsys, monkeypatch, tmp_pa
     code, stdout, stderr = run(capsys, monkeypatch, "identify", path, "--out", out)
     assert (code, stdout, out.exists()) == (2, "", False)
     assert "pressed.csv: The creep test has position and force of opposite signs; multiply" in " ".join(stderr.split())
+
+
+@pytest.mark.deep
+def test_a_force_that_rises_while_held_is_refused_with_file_and_cause(capsys, monkeypatch, tmp_path):
+    path, out, t = tmp_path / "rising.csv", tmp_path / "out", np.arange(300) * 0.01
+    ramp = np.minimum(t / 0.03, 1)
+    write([Test("relaxation", t, (ramp * (1 + 0.02 * t))[None], 5 * ramp[None])], path)
+    code, stdout, stderr = run(capsys, monkeypatch, "identify", path, "--out", out)
+    assert (code, stdout, out.exists()) == (2, "", False)
+    assert re.search(
+        r"rising.csv: The best fit has K1 = -0.055\d* N/mm, .* \(the force of the relaxation test rises from 1.003 to"
+        r" 1.057 N while its position is held \(5 to 5 mm, 0.03 to 2.99 s\)\); check",
+        " ".join(stderr.split()),
+    )
+
+
+@pytest.mark.deep
+def test_identify_reads_an_instruments_table_by_the_options_that_its_refusals_name(capsys, monkeypatch, tmp_path):
+    path, out = tmp_path / "foam.txt", tmp_path / "out"
+    path.write_bytes(CASES["RheoCompass, intervals"].data)
+    arguments = ["identify", path, "--out", out, "--no-compare", "--lag", 0]
+    for words, options in (
+        ("choose one by --block 1", ["--block", 2, "--block", 3]),
+        ("give its area in mm2 by --area and its thickness in mm by --gap", ["--area", AREA, "--gap", GAP]),
+        ("or give --test relaxation", ["--test", "relaxation"]),
+    ):
+        code, _, stderr = run(capsys, monkeypatch, *arguments)
+        assert code == 2 and words in " ".join(stderr.split()) and not out.exists()
+        arguments += options
+    code, _, stderr = run(capsys, monkeypatch, *arguments)
+    assert code == 0 and "blocks 2 and 3 of 3 were read" in " ".join(stderr.split())
+    (tmp_path / "plain.csv").write_bytes(PLAIN)
+    plain = ["identify", tmp_path / "plain.csv", "--out", tmp_path / "plain", "--no-compare", "--lag", 0]
+    assert run(capsys, monkeypatch, *plain)[0] == 0
+    ours, theirs = (json.loads((folder / "result.json").read_text())["set"] for folder in (out, tmp_path / "plain"))
+    assert ours == pytest.approx(theirs, rel=1e-7)
 
 
 def write(tests, path):

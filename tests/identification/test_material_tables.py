@@ -107,7 +107,7 @@ def changed(**cells):
     [
         (HEAD.replace(" (ms)", ""), ROWS, 't.csv:1: column "time" has no unit; write it like "time \\(s\\)"'),
         (HEAD.replace("ms", "parsec"), ROWS, 'has the unit "parsec"'),
-        (HEAD.replace("force_N", "load"), ROWS, "found time, position"),
+        (HEAD.replace("force_N", "other"), ROWS, 'found time, position among .* --column "force_N='),
         (HEAD.replace("test", "kind"), ROWS, 'column "test" is missing'),
         (HEAD + ",F_N", [(*row, 1) for row in ROWS], 'columns "force_N" and "F_N" both are a force'),
         (HEAD, changed(test="tension"), 't.csv:5: test is "tension"'),

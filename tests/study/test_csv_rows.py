@@ -58,6 +58,7 @@ REFUSED = {
         "{path}:2: has {longer} cells, the",
     ),
 }
+TAKEN = {("material", case) for case in ("utf-16", "latin-1", "a spreadsheet's first line")}  # instruments write these
 ACCEPTED = {
     "as it is": lambda text: text.encode(),
     "semicolons and a mark of the byte order": lambda text: text.replace(",", ";").encode("utf-8-sig"),
@@ -71,9 +72,12 @@ ACCEPTED = {
 @pytest.mark.parametrize("table", TABLES)
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_is_no_table_is_refused_by_all_readers_in_the_same_words(tmp_path, table, case):
-    read, header, rows, _ = TABLES[table]
+    read, header, rows, values = TABLES[table]
     path, (broken, sentence) = tmp_path / "t.csv", REFUSED[case]
     path.write_bytes(broken("\n".join([header, *rows, ""])))
+    if (table, case) in TAKEN:
+        assert read(path) == values
+        return
     with pytest.raises(InputError) as refused:
         read(path)
     assert str(refused.value).startswith(sentence.format(path=path, longer=header.count(",") + 3))
