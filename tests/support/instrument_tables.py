@@ -189,7 +189,7 @@ CASES: dict[str, Case] = {
     "TRIOS for LIMS": Case(text([*LIMS, *LIMS_STEP, *LIMS_TABLE], "\t").encode("utf-8"), GEOMETRY, False),
     "TRIOS for LIMS, two steps": Case(
         text([*LIMS, *CONDITIONING, *LIMS_STEP, *LIMS_TABLE], "\t").encode("utf-8"),
-        *(GEOMETRY, False, 'holds 2 blocks .1: ".step., Conditioning - 1", line 8, 5 rows; 2: "Stress relaxation'),
+        *(GEOMETRY, False, 'contains 2 blocks .1: ".step., Conditioning - 1", line 8, 5 rows; 2: "Stress relaxation'),
         with_options(blocks=(2,)),
     ),
     "TRIOS without the geometry": Case(
@@ -209,7 +209,7 @@ CASES: dict[str, Case] = {
     "RheoCompass, commas": Case(text(ONE_INTERVAL, "\t", True).encode("utf-16"), GEOMETRY, False),
     "RheoCompass, intervals": Case(
         text(INTERVALS, ",").encode("utf-8-sig"),
-        *(GEOMETRY, False, "holds 3 blocks"),
+        *(GEOMETRY, False, "contains 3 blocks"),
         with_options(blocks=(2, 3)),
     ),
     "Bluehill": Case(text(BLUEHILL, quotes=True).encode(), exact=False),

@@ -135,7 +135,7 @@ def chosen(blocks: Sequence[Block], layout: Layout, source: str) -> tuple[Block,
     listed += "; …" if len(filled) > _MOST else ""
     missing = next((number for number in layout.blocks if not 1 <= number <= len(filled)), None)
     if missing is not None or not layout.blocks:
-        what = f"holds {len(filled)} blocks" if missing is None else f"has no block {missing}"
+        what = f"contains {len(filled)} blocks" if missing is None else f"has no block {missing}"
         raise InputError(
             f"{source}: {what} ({listed}); choose one by --block 1, or several that follow one another by --block 1"
             " --block 2."
