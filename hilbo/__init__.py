@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import lazy_loader
 
-_names, __dir__, __all__ = lazy_loader.attach(
+_names, _, _every = lazy_loader.attach(
     __name__,
     submodules=[
         "acquisition",
@@ -41,10 +41,31 @@ _names, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "errors": ["InputError"],
         "ordinal_gp": ["RBF", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"],
+        "report.figures.on_axes": ["plot_map"],
         "session.choose.ask_tell": ["Session"],
+        "study.analysis.prediction": ["aggregate", "best", "predict"],
+        "study.cohort": ["read_trials"],
         "study.config": ["Study"],
     },
 )
+
+__all__ = [
+    "RBF",
+    "InputError",
+    "OrdinalGP",
+    "OrdinalProbit",
+    "Posterior",
+    "Session",
+    "Study",
+    "Trials",
+    "aggregate",
+    "best",
+    "fit",
+    "plot_map",
+    "predict",
+    "read_trials",
+]
+"""The objects of the package; its modules are attributes too, and are not imported by `from hilbo import *`."""
 
 if TYPE_CHECKING:  # the same names for type checkers and editors; a test compares the two lists
     from hilbo import acquisition as acquisition
@@ -81,10 +102,19 @@ if TYPE_CHECKING:  # the same names for type checkers and editors; a test compar
     from hilbo.ordinal_gp import Posterior as Posterior
     from hilbo.ordinal_gp import Trials as Trials
     from hilbo.ordinal_gp import fit as fit
+    from hilbo.report.figures.on_axes import plot_map as plot_map
     from hilbo.session.choose.ask_tell import Session as Session
+    from hilbo.study.analysis.prediction import aggregate as aggregate
+    from hilbo.study.analysis.prediction import best as best
+    from hilbo.study.analysis.prediction import predict as predict
+    from hilbo.study.cohort import read_trials as read_trials
     from hilbo.study.config import Study as Study
 
     __version__: str
+
+
+def __dir__() -> list[str]:
+    return sorted(_every)
 
 
 def __getattr__(name: str):

@@ -23,6 +23,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Shaped
 
+from hilbo.errors import InputError
 from hilbo.numerics.shown import check_positive, float_dtype, floats, numbers, shown
 
 __all__ = ["RBF", "Kernel", "Levels", "Matern32", "Stationary", "embedded", "gram", "theta_of"]
@@ -56,8 +57,10 @@ class RBF(eqx.Module):
     - `theta`: inverse squared length, > 0, scalar or (d,), per squared unit of x.
     - `variance`: prior variance of the latent function, > 0.
     - `levels`: for each coordinate its number of unordered levels, 0 for a numeric one; default: all numeric.
+    - `length_scale`: in place of theta, which is 1 / (2 length_scale^2).
 
-    Raises `InputError` for numbers that are not above 0; traced negative numbers give NaN.
+    Raises `InputError` for numbers that are not above 0, and for both or none of theta and length_scale; traced
+    negative numbers give NaN.
     """
 
     theta: Float[Array, "*d"]
@@ -65,12 +68,28 @@ class RBF(eqx.Module):
     levels: tuple[int, ...] = eqx.field(static=True, default=())
 
     def __init__(
-        self, theta: ArrayLike | Sequence[float | int], variance: ArrayLike = 1.0, levels: tuple[int, ...] = ()
+        self,
+        theta: ArrayLike | Sequence[float | int] | None = None,
+        variance: ArrayLike = 1.0,
+        levels: tuple[int, ...] = (),
+        *,
+        length_scale: ArrayLike | Sequence[float | int] | None = None,
     ):
+        if (theta is None) == (length_scale is None):
+            raise InputError("RBF: give either theta or length_scale.")
+        if theta is None:
+            lengths = numbers("RBF", "length_scale", length_scale, float_dtype(length_scale))
+            check_positive("RBF", length_scale=lengths)
+            theta = 0.5 / lengths**2
         self.theta = numbers("RBF", "theta", theta, float_dtype(theta))
         self.variance = numbers("RBF", "variance", variance, float_dtype(variance))
         self.levels = levels
         check_positive("RBF", theta=self.theta, variance=self.variance)
+
+    @property
+    def length_scale(self) -> Float[Array, "*d"]:
+        """Length scale of each coordinate, sqrt(1 / (2 theta)); the covariance is exp(-1/2) at this distance."""
+        return jnp.sqrt(0.5 / self.theta)
 
     def __repr__(self) -> str:
         return f"RBF({_numbers_shown(self)})"

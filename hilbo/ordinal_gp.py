@@ -132,6 +132,10 @@ class Posterior(eqx.Module):
         mean, variance = self.predict(x)
         return jax.vmap(self.gp.likelihood.class_probabilities)(mean, variance)
 
+    def predict_proba(self, x: _PointsLike) -> Float[Array, "m categories"]:
+        """`class_probabilities` under the name that scikit-learn has for it."""
+        return self.class_probabilities(x)
+
     def standard_errors(
         self, x: _PointsLike
     ) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, "m categories"]]:

@@ -32,6 +32,7 @@ from hilbo import (
     passivity,
     viscoelastic,
 )
+from hilbo.errors import InputRemark
 from hilbo.kernels import Matern32
 from hilbo.search.box import Mechanics, Parameter
 
@@ -459,6 +460,33 @@ def test_trees_of_something_else_have_words_too(posterior):
     assert "converged=True" in repr(posterior.certificate)
 
 
+def test_a_state_that_has_had_its_response_warns(session):
+    session = copy.copy(session)  # others have given responses to the shared one
+    session.ask()
+    following = session.tell(session.study.responses[0])
+    following.ask()
+    with pytest.warns(InputRemark, match="this state has had its response; keep the next one"):
+        session.ask()
+
+
+def test_a_length_scale_is_another_way_to_state_theta():
+    np.testing.assert_allclose(RBF(length_scale=(0.1, 0.5)).theta, [50.0, 2.0], rtol=1e-15)
+    np.testing.assert_allclose(RBF(30.0).length_scale, np.sqrt(1 / 60), rtol=1e-15)
+    for arguments in ({}, {"theta": 1.0, "length_scale": 1.0}):
+        with pytest.raises(InputError, match="give either theta or length_scale"):
+            RBF(**arguments)
+    with pytest.raises(InputError, match="RBF: length_scale is -1"):
+        RBF(length_scale=-1.0)
+
+
+def test_a_star_import_brings_no_modules():
+    names = {}
+    exec("from hilbo import *", names)
+    assert {"Study", "read_trials", "aggregate", "predict", "plot_map"} <= set(names)
+    assert not {"statistics", "trials", "search"} & set(names)
+    assert "statistics" in dir(hilbo)
+
+
 @pytest.mark.deep  # fits, and draws a map: 20 s
 def test_the_guide_s_calls_can_be_made():
     page = (Path(__file__).parents[1] / "docs" / "guides" / "in-python.md").read_text(encoding="utf-8")
@@ -468,11 +496,20 @@ def test_the_guide_s_calls_can_be_made():
     frame = pd.DataFrame(np.asarray(study.space.to_physical(x)), columns=list(study.space.names))
     answers = {"participant": np.repeat(["A", "B", "C"], 8), "trial": np.tile(np.arange(1, 9), 3)}
     table = frame.assign(**answers, response=np.array(study.responses)[rng.integers(0, 3, 24)])
-    names = {"table": table, "study": study, "frame": frame, "axes": Figure().subplots(), "hilbo": hilbo, "jax": jax}
+    names = {
+        "table": table[[*answers, "response", *study.space.names]],
+        "study": study,
+        "frame": frame,
+        "axes": Figure().subplots(),
+        "hilbo": hilbo,
+        "jax": jax,
+    }
     block = page.split("```python\n")[1].split("```")[0]
-    exec(block.replace('study = Study.load("study.toml")\n', ""), names)
+    block = block.replace('study = hilbo.Study.load("study.toml")\n', "")
+    block = block.replace('hilbo.read_trials("trials.csv", study)', "table").replace('("hue", "light")', '("K1", "B1")')
+    exec(block, names)
     calls = re.findall(r"\| `((?:hilbo|jax)\.[^`]*)`", page)
-    assert len(calls) == 4
+    assert len(calls) == 5
     for call in calls:
         importlib.import_module(call.split("(")[0].rpartition(".")[0])
         assert eval(call, names) is not None

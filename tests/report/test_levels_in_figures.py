@@ -43,7 +43,7 @@ class Asked:
 def curve_of_a_map(asked, monkeypatch):
     monkeypatch.setattr(on_axes, "_mean_and_variance", lambda model, x: asked.predict(x))
     axes = Figure().subplots()
-    on_axes.draw_map(ONE, fit(ONE.gp, Trials.from_arrays(np.array([[0.5]]), np.array([2]))), ax=axes)
+    on_axes.plot_map(ONE, fit(ONE.gp, Trials.from_arrays(np.array([[0.5]]), np.array([2]))), ax=axes)
     return axes
 
 

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from studies import PLAIN
 
 from hilbo import InputError, Study
-from hilbo.report.figures.on_axes import draw_map
-from hilbo.study.analysis.prediction import predict_table
+from hilbo.report.figures.on_axes import plot_map
+from hilbo.study.analysis.prediction import predict
 from hilbo.study.cohort import cohort_of, read_trials
 from hilbo.study.estimate.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.file.reserved_names import is_reserved
@@ -83,7 +83,7 @@ X = np.array([[0.25, (12 - 10) / 10], [1.0, 1.0]])
 
 
 def check_predicted(model, moments, chances):
-    predicted = predict_table(STUDY, model, ASK)
+    predicted = predict(STUDY, model, ASK)
     assert list(predicted.columns) == ["v", "u", "name", "mean", "sd", *(f"P({r})" for r in STUDY.responses)]
     assert all(is_reserved(name, STUDY.responses, False) for name in predicted.columns.drop([*ASK]))
     assert list(predicted.index) == ["r1", "r2"] and list(ASK.columns) == ["v", "u", "name"]
@@ -112,7 +112,7 @@ def test_predictions_of_the_population_are_those_of_a_new_participant(aggregate)
     chances = aggregate.class_probabilities(STUDY.gp.likelihood, X)
     check_predicted(aggregate, aggregate.surface(X), chances)
     axes = Figure().subplots(1, 2)
-    assert draw_map(STUDY, aggregate, ("v", "u"), ax=axes[0]) is axes[0]
+    assert plot_map(STUDY, aggregate, ("v", "u"), ax=axes[0]) is axes[0]
     assert axes[0].get_xlabel() == "v" and axes[0].get_xlim() == (10, 20) and not axes[1].collections
     best = np.asarray(STUDY.space.to_physical(aggregate.optimum.x))
     np.testing.assert_allclose(axes[0].lines[0].get_xydata()[0], best[::-1])
@@ -120,9 +120,9 @@ def test_predictions_of_the_population_are_those_of_a_new_participant(aggregate)
 
 @pytest.mark.deep
 def test_a_persons_map_is_drawn_and_arviz_has_what_the_file_of_the_command_line_has(cohort, people, one):
-    assert draw_map(STUDY, one).get_xlabel() == "u"
+    assert plot_map(STUDY, one).get_xlabel() == "u"
     with pytest.raises(InputError, match="give two of u, v"):
-        draw_map(STUDY, one, ("u", "w"))
+        plot_map(STUDY, one, ("u", "w"))
     data = inference_data(STUDY, cohort, people, draws=3)
     assert data.groups() == ["posterior", "posterior_predictive", "log_likelihood", "observed_data", "constant_data"]
     assert data.observed_data["response"].sizes == {"obs_id": int(cohort.counts().sum())}
@@ -133,8 +133,8 @@ def test_what_cannot_be_predicted_is_one_sentence(one, people):
     for model, table, words in (
         (one, ask.assign(v=9.0), 'DataFrame: row 1: v is "9.0"; it must be a number from 10 to 20'),
         (one, ask[["u"]], 'DataFrame: column "v" is missing; a rendering of this study has u, v.'),
-        (people, ask, "predict_table: the posterior is of several participants"),
+        (people, ask, "predict: the posterior is of several participants"),
     ):
         with pytest.raises(InputError) as refused:
-            predict_table(STUDY, model, table)
+            predict(STUDY, model, table)
         assert str(refused.value).startswith(words)

@@ -1,8 +1,8 @@
 """A map on given axes: for notebooks, and figures of several panels.
 
 figure, axes = pyplot.subplots(1, 2)
-draw_map(study, posterior, ax=axes[0])
-draw_map(study, aggregate, ("K1", "alpha"), ax=axes[1])
+plot_map(study, posterior, ax=axes[0])
+plot_map(study, aggregate, ("K1", "alpha"), ax=axes[1])
 """
 
 from functools import partial
@@ -20,13 +20,13 @@ from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate
 from hilbo.study.estimate.optimum import best_point
 
-__all__ = ["draw_map"]
+__all__ = ["plot_map"]
 
 _CELLS = 61
 
 
 @styled
-def draw_map(
+def plot_map(
     study: Study, model: Posterior | Aggregate, pair: tuple[str, str] | None = None, *, ax: Axes | None = None
 ) -> Axes:
     """Draw the mean of one participant's posterior, or of the population map, over two parameters through its maximum.
@@ -72,14 +72,14 @@ def _maximum(study: Study, model: Any) -> np.ndarray:
     if isinstance(model, Aggregate):
         return np.asarray(model.optimum.x)
     if not isinstance(model, Posterior):
-        raise InputError(f"draw_map: model is a {type(model).__name__}; give a Posterior or an Aggregate.")
+        raise InputError(f"plot_map: model is a {type(model).__name__}; give a Posterior or an Aggregate.")
     return np.asarray(best_point(study.goal, study.space, model, search_points(study.space, 0)).x)
 
 
 def _places(names: tuple[str, ...], pair: Any) -> tuple[int, int]:
     """Indices of a pair of parameters. Raises `InputError` unless they are two different names of `names`."""
     if len(pair) != 2 or len(set(pair)) != 2 or not set(pair) <= set(names):
-        raise InputError(f"draw_map: pair is {tuple(pair)}; give two of {', '.join(names)}.")
+        raise InputError(f"plot_map: pair is {tuple(pair)}; give two of {', '.join(names)}.")
     return names.index(pair[0]), names.index(pair[1])
 
 

@@ -11,6 +11,7 @@ log, of a table, on another day) gives the same points bit for bit.
 """
 
 import threading
+import weakref
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, SupportsFloat
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from hilbo.errors import InputError
+from hilbo.errors import InputError, warn_caller
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.search.box import Parameter
@@ -30,6 +31,7 @@ from hilbo.study.config import Study
 __all__ = ["Session", "physical_trials"]
 
 _LARGEST_SEED = 2**63 - 1  # of JAX's keys
+_HAD_RESPONSES: "weakref.WeakSet[Session]" = weakref.WeakSet()
 
 
 def physical_trials(study: Study, points: np.ndarray, answers: np.ndarray, capacity: int) -> Trials:
@@ -123,8 +125,13 @@ class Session:
     def ask(self) -> dict[str, Any]:
         """The rendering to present next: parameter -> value in physical units, levels by name; the same until `tell`.
 
-        Raises `InputError` once all trials of the study are answered.
+        A state that has had its response asks for the same stimulus again, with a warning: `tell` returns the next
+        state. Raises `InputError` once all trials of the study are answered.
         """
+        if self in _HAD_RESPONSES:
+            warn_caller(
+                "Session: this state has had its response; keep the next one: session = session.tell(response)."
+            )
         return self._named(_asked(self))
 
     def tell(self, response: str, at: Mapping[str, Any] | pd.Series | None = None) -> "Session":
@@ -144,6 +151,7 @@ class Session:
         shown = asked if at is None else self._point(at)
         points = np.concatenate([self.points, shown[None, :]])
         points, answers = _read_only(points, np.append(self.answers, step.responses.index(response)))
+        _HAD_RESPONSES.add(self)
         return replace(self, points=points, answers=answers, proposal=step(points, answers))
 
     def _named(self, point: np.ndarray) -> dict[str, Any]:

@@ -1,6 +1,9 @@
-"""Predictions of a study at stimuli in physical units, from a DataFrame to a DataFrame.
+"""The verbs of an analysis in Python: aggregate a table, read the optimum, predict at stimuli in physical units.
 
-predicted = predict_table(study, aggregate, pd.DataFrame({"K1": [5.6], "B1": [7.9], "alpha": [0.18]}))
+trials = read_trials("trials.csv", study)
+result = aggregate(study, trials)
+best(study, result)
+predicted = predict(study, result, pd.DataFrame({"K1": [5.6], "B1": [7.9], "alpha": [0.18]}))
 """
 
 import jax.numpy as jnp
@@ -10,14 +13,38 @@ import pandas as pd
 from hilbo.errors import InputError
 from hilbo.numerics.shown import has_values
 from hilbo.ordinal_gp import Posterior
+from hilbo.search.rendering import Rendering
+from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
-from hilbo.study.estimate.aggregate import Aggregate
+from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort
 from hilbo.study.formats.csv_file import FRAME, cells_of, parameter_values, place
+from hilbo.study.tables.trials import TrialTable
 
-__all__ = ["predict_table"]
+__all__ = ["aggregate", "best", "predict"]
 
 
-def predict_table(study: Study, model: Posterior | Aggregate, table: pd.DataFrame) -> pd.DataFrame:
+def aggregate(study: Study, trials: pd.DataFrame | TrialTable | Cohort, seed: int = 0) -> Aggregate:
+    """Aggregate responses into the population map by the study's method, and find its optimum.
+
+    **Arguments:** `trials`: a trial table, as `read_trials` returns it or a DataFrame of your own, or a cohort. `seed`:
+    determines the points at which optima are searched.
+
+    Other methods, and each participant's optimum, are left out; `aggregate_cohort` computes them. Raises `InputError`
+    for an invalid table.
+    """
+    cohort = trials if isinstance(trials, Cohort) else cohort_of(trials, study)
+    return aggregate_cohort(study, cohort, seed, alternatives=False, individuals=False)
+
+
+def best(study: Study, model: Aggregate) -> dict[str, float | str]:
+    """The population optimum in physical units: parameter -> value, levels by name, with K0 if the study has a
+    renderer. Raises `InputError` for another type of model."""
+    if not isinstance(model, Aggregate):
+        raise InputError(f"best: model is a {type(model).__name__}; give an Aggregate.")
+    return Rendering.at(study.space, model.optimum.x).shown
+
+
+def predict(study: Study, model: Posterior | Aggregate, table: pd.DataFrame) -> pd.DataFrame:
     """Copy of the table with predictions for each row: `mean` and `sd` of the latent function, and for every response
     of the study its probability, in a column `P(response)`.
 
@@ -34,16 +61,14 @@ def predict_table(study: Study, model: Posterior | Aggregate, table: pd.DataFram
     x = _points(study, table)
     if isinstance(model, Posterior):
         if not has_values(model.trials.mask) or model.trials.mask.ndim != 1:
-            raise InputError(
-                "predict_table: the posterior is of several participants; give one of them, or the Aggregate."
-            )
+            raise InputError("predict: the posterior is of several participants; give one of them, or the Aggregate.")
         mean, variance = model.predict(x)
         chances = model.class_probabilities(x)
     elif isinstance(model, Aggregate):
         mean, variance = model.surface(x)
         chances = model.class_probabilities(model.likelihood, x)
     else:
-        raise InputError(f"predict_table: model is a {type(model).__name__}; give a Posterior or an Aggregate.")
+        raise InputError(f"predict: model is a {type(model).__name__}; give a Posterior or an Aggregate.")
     predicted = {"mean": np.asarray(mean), "sd": np.sqrt(np.asarray(variance))}
     predicted |= {f"P({label})": column for label, column in zip(study.responses, np.asarray(chances).T, strict=True)}
     return table.assign(**predicted)
