@@ -117,6 +117,13 @@ def test_the_choice_of_a_method_is_read_in_five_minutes():
     assert len(figures) == 2 and all((DOCS / "methods" / figure).is_file() for figure in figures)
 
 
+def test_the_page_on_citing_has_the_version_of_the_package():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    page = (DOCS / "guides" / "citing.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"\b\d+\.\d+\.\d+\b", page)) == {version}
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
 def test_a_notebook_becomes_text_and_code(tmp_path, monkeypatch):
     made = script("hooks")
     path = made.ROOT / "notebooks" / "quick_start.py"

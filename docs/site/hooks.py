@@ -61,6 +61,7 @@ ELSEWHERE = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
 }
+UNSEARCHED = "---\nsearch:\n  exclude: true\n---\n\n"  # the changelog has every word
 NOTEBOOKS = {f"notebooks/{path.name}": f"notebooks/{path.stem}.md" for path in sorted(ROOT.glob("notebooks/*.py"))}
 PLACES = ELSEWHERE | NOTEBOOKS  # file of the project -> page of the site
 
@@ -68,6 +69,7 @@ PLACES = ELSEWHERE | NOTEBOOKS  # file of the project -> page of the site
 def generated() -> dict[str, str]:
     """Page of the site -> its Markdown, of all pages that docs/ does not hold."""
     text = {page: (ROOT / file).read_text(encoding="utf-8") for file, page in ELSEWHERE.items()}
+    text["changelog.md"] = UNSEARCHED + text["changelog.md"]
     text |= {page: notebook(ROOT / file) for file, page in NOTEBOOKS.items()}
     return text | {f"api/{name}.md": reference(*entry) for name, entry in API.items()}
 
