@@ -1,4 +1,4 @@
-"""How long a participant waits: from an answer to the next parameters in force on the device, through the real server.
+"""How long a participant waits: from a response to the next active parameters on the device, through the real server.
 
     python benchmarks/live.py --trials 500 --write      # into docs/guides/live.md
 
@@ -111,9 +111,9 @@ def quantiles(values) -> str:
 def table(delays, ready, imports, proposed, told, fits) -> str:
     """Markdown."""
     parts = {
-        "answer to parameters in force": "total",
-        "… of which the answer's fsync": "fsync",
-        "… the answer acknowledged after": "acknowledged",
+        "response to active parameters": "total",
+        "… of which the response's fsync": "fsync",
+        "… the response acknowledged after": "acknowledged",
         "… the next proposal looked up": "chosen",
         "… conversation with the device": "serial",
     }

@@ -15,8 +15,8 @@ def __dir__() -> list[str]:
 class InputError(ValueError):
     """Bad input from outside: a study file, a table, an argument.
 
-    The message is one sentence that says what is wrong, where it is (file and line, or the key's path), and what
-    to do about it. The command line prints it as it stands and ends with exit code 2.
+    The message is one sentence with the place (file and line, or the key's path), the error, and the remedy.
+    The command line prints it and ends with exit code 2.
     """
 
 

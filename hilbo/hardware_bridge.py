@@ -6,7 +6,7 @@
         table = device.telemetry(2.0)
 
 The firmware has the final say: it checks every set again, with its own damping, and rejects it with a reason. It
-renders only while this process sends heartbeats, and is stopped at the end of the block in every case. The set in force
+renders only while this process sends heartbeats, and is stopped at the end of the block in every case. The active set
 is read back and compared bit for bit. A device that restarts is never started again automatically. No JAX here;
 firmware/PROTOCOL.md specifies the wire protocol.
 
@@ -175,11 +175,11 @@ class Renderer:
             raise
 
     def send(self, wanted: ParameterSet | None = None, /, *, wait: SupportsFloat = 5.0, **values: Any) -> InForce:
-        """Put a parameter set in force: stage, commit, read back and compare bit for bit.
+        """Activate a parameter set: stage, commit, read back and compare bit for bit.
 
         Either a `ParameterSet`, or its fields as `values`: K0, K1 in N/mm, B1 in N·s^α/mm, alpha, and optionally N, T
         in s, memory, states, and force_limit in N. In contact the device first fills the history of the new set; `wait`
-        (s) is the timeout for that. A set that is in force already is not sent again.
+        (s) is the timeout for that. A set that is active already is not sent again.
         Raises `InputError` for numbers that do not fit and for a set that the device refuses, `DeviceError` if the
         line fails.
         """
@@ -187,7 +187,7 @@ class Renderer:
         return put_in_force(self._link, self.device, messages, float(wait))
 
     def in_force(self) -> InForce | None:
-        """Ask the device for the parameter set in force; None if there is none."""
+        """Ask the device for the active parameter set; None if there is none."""
         return in_force(self._link.request(GetSet(bank=0)))
 
     @property
@@ -203,11 +203,11 @@ class Renderer:
         self._link.request(Home(boot_id=self.device.boot_id, **place))
 
     def start(self, *, stop: int | None = None, wait: SupportsFloat = 5.0) -> None:
-        """Start rendering the set in force. Earlier telemetry is dropped.
+        """Start rendering the active set. Earlier telemetry is dropped.
 
         `stop`: the device's count of stops that the caller has seen (`link.stops`), by default the latest one known:
         after a later stop the device refuses to start. `wait` (s): timeout for the handle to leave the material, since
-        nothing is started in contact. Raises `DeviceError` if no set is in force, if the handle stays in contact, and
+        nothing is started in contact. Raises `DeviceError` if no set is active, if the handle stays in contact, and
         for other refusals.
         """
         stop = self._link.stops if stop is None else stop
@@ -270,7 +270,7 @@ class Renderer:
     def stream(self, divisor: int = 1, *, sensed: bool | None = None) -> int:
         """Switch on telemetry of every `divisor`-th tick, or fewer if the line is too slow; 0 switches it off.
 
-        `sensed`: include the force sensor, by default if there is one. Returns the divisor in force.
+        `sensed`: include the force sensor, by default if there is one. Returns the active divisor.
         """
         fields = int(bool(self.can & Capability.FORCE_SENSOR) if sensed is None else sensed)
         try:

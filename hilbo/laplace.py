@@ -77,8 +77,8 @@ def laplace(
     **Arguments:**
 
     - `covariance`: K, (n, n), symmetric, positive semi-definite. Terms that always return 0 (padding) change nothing.
-    - `terms`: eta (n,) -> values, slopes and curvatures, (n,) each; a pytree (an `eqx.Module`, say) if it holds arrays
-      that are traced. [`Pointwise`][] makes one from values alone.
+    - `terms`: eta (n,) -> values, slopes and curvatures, (n,) each; a pytree (such as an `eqx.Module`) if it contains
+      arrays that are traced. [`Pointwise`][] makes one from values alone.
     - `start`: `weights` (n,) of an earlier, similar fit (default: 0); changes the number of steps, not the result.
     - `max_steps`: largest number of Newton steps of each search.
 

@@ -1,6 +1,6 @@
 """Newton's method for the mode of a log-concave posterior, as two root finders of optimistix.
 
-Full steps on the weights, and damped steps in any coordinates. A module of its own because optimistix is slow to
+Full steps on the weights, and damped steps in any coordinates. A separate module because optimistix is slow to
 import: `hilbo.laplace` imports it only when a fit is traced.
 """
 

@@ -47,7 +47,7 @@ _SOUGHT = {
     "exact": "exact posterior",
 }
 _PointsLike = ArrayLike | Sequence[Sequence[float]]
-_CACHED, _PARTS = 2**16, 8  # covariances held at a time when many points are predicted, in at most so many parts
+_CACHED, _PARTS = 2**16, 8  # covariances in memory when many points are predicted, and largest number of parts
 
 
 class InferenceError(RuntimeError):

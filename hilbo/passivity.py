@@ -75,7 +75,7 @@ def minimum_damping(
     `delay`: from a sample of the position to its force, s, from 0 to T; if above 0 the result has a relative error of
     1e-6.
 
-    `inf` where `K_eff` < 0: a negative static stiffness is active with any damping. For a set with a K0 of its own,
+    `inf` where `K_eff` < 0: a negative static stiffness is active with any damping. For a set with a given K0,
     `K_eff` is its `viscoelastic.dc_gain`. Raises `InputError` for even N, and for values out of range; where these are
     traced the result is NaN.
     """
@@ -152,7 +152,7 @@ def largest_K1_beside(model: FOSLS, b: float, *, delay: float = 0.0) -> float:
 
 
 def _checked_span(memory: Memory, N: int) -> Span:
-    """Memory as a `Span`. Raises `InputError` for short memory of even N, for which the closed forms do not hold."""
+    """Memory as a `Span`. Raises `InputError` for short memory of even N, for which the closed forms are not valid."""
     if memory == "short" and N % 2 == 0:
         raise InputError(f"N is {N}; it must be odd: the closed passivity bound is too low for an even number of taps.")
     return span(memory, N)

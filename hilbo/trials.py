@@ -114,7 +114,7 @@ class Trials(eqx.Module):
         )
 
     def first(self, count: ArrayLike) -> "Trials":
-        """Copy in which only the first `count` rows may hold a response: the mask is False from row `count` on.
+        """Copy in which only the first `count` rows may have a response: the mask is False from row `count` on.
 
         Points, categories and capacity stay. `count`: an int, from 0 to the capacity, may be traced.
         """

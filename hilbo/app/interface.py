@@ -38,7 +38,7 @@ class RunnerInterface(Protocol):
         """Have the task check the condition that it waits for (Begin, or the rig) again."""
 
     def forget(self) -> None:
-        """Record that the rig has no rendering in force, so that the next one is prepared again."""
+        """Record that the rig has no active stimulus, so that the next one is prepared again."""
 
 
 @runtime_checkable
@@ -68,7 +68,7 @@ class HubInterface(Protocol):
     gap: float
     """Pause between two trials, s."""
     delays: list[dict[str, float]]
-    """Seconds from each answer to the next parameters in force, by part."""
+    """Seconds from each answer to the next active parameters, by part."""
     without_map: str
     """Why there is no map, as a sentence; empty where there is one."""
     alert: str | None
@@ -100,7 +100,7 @@ class HubInterface(Protocol):
 
     @property
     def recent(self) -> Sequence[Event | Notice]:
-        """The latest events, and what the device sent unasked, which the log does not hold; newest first."""
+        """The latest events, and unsolicited messages of the device, which are not in the log; newest first."""
         ...
 
     @property

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = ["aggregate", "aggregate_cohort", "read_cohort", "robustness"]
 
-# What draws and writes, loaded beside the arithmetic. Packages that the arithmetic never imports, because two threads
-# that import one package at once may see half of it.
+# Modules for figures and files, loaded during the arithmetic. Packages that the arithmetic never imports, because two
+# threads that import one package at once may see half of it.
 _DRAW_AND_WRITE = ("matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2")
 
 StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
@@ -100,7 +100,7 @@ def aggregate(
             folder = held.enter_context(results(out, force)) if team.writes else None
             chosen, cohort, flagged = read_cohort(trials, study, material, say)
             cohort = _chosen(cohort, participants) if participants else cohort
-            cohort, left_out = _included(chosen, cohort, say)  # by the study's own model, whatever --rule aggregates
+            cohort, left_out = _included(chosen, cohort, say)  # by the study's model, for any --rule
             left_out = [*flagged, *left_out]
             chosen = chosen if rule is None else by_rule(chosen, rule)
             cohort = cohort.first(first) if first else cohort

@@ -1,4 +1,4 @@
-"""`hilbo cache`: show or delete the compiled functions that are kept from one command to the next."""
+"""`hilbo cache`: show or delete the compiled functions that are cached between commands."""
 
 import shutil
 from pathlib import Path

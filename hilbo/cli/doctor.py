@@ -94,7 +94,7 @@ def _disk(folder: Path) -> Check:
     """Whether the folder of the logs, or the nearest one above it that exists, can be written, how fast, and how much
     room there is."""
     above = (folder, *folder.resolve().parents)
-    place = next((path for path in above if os.path.lexists(path)), folder)  # a session makes what is missing below
+    place = next((path for path in above if os.path.lexists(path)), folder)  # a session makes missing folders below
     try:
         with tempfile.NamedTemporaryFile(dir=place) as file:
             begun = time.perf_counter()

@@ -31,7 +31,7 @@ def imports(
 ) -> None:
     """Convert the export of another program to a trial table.
 
-    Writes the table, the mapping by which it was made, a record of what was done, and, if ids are changed, the list of
+    Writes the table, the mapping by which it was made, a record, and, if ids are changed, the list of
     old and new ids.
     """
     if out.suffix != ".csv":

@@ -202,7 +202,7 @@ def doctor(
     ] = False,
     as_json: JsonToo = False,
 ) -> None:
-    """Check that everything is ready for a session, and print how to fix what is not.
+    """Check that everything is ready for a session, and print the remedy for each failed check.
 
     Exit code 1 if something is bad.
     """

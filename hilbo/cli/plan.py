@@ -44,7 +44,7 @@ def plan(
     force: ForceFile = False,
     as_json: JsonToo = False,
 ) -> None:
-    """Plan a whole study in advance: orders, seeds and validation sets, with a hash that every log will hold.
+    """Plan a whole study in advance: orders, seeds and validation sets, with a hash that every log will contain.
 
     An optimisation of a study with `[plan] people` assigns each participant to one material at random. With --source
     individual everybody is validated with the materials of which they have a map.
@@ -65,7 +65,7 @@ def plan(
     check_choice("source", source, ("aggregate", "individual"))
     materials = tuple(material or file.materials)
     for name in materials:
-        file.material(name)  # refuses what is none
+        file.material(name)  # refuses an invalid one
     paths = {} if kind == "optimisation" else _by_material(materials, results_ or [])
     if kind == "optimisation" and not material and file.plan.people:
         materials = ()

@@ -209,7 +209,7 @@ def keep_beating(line: int, boot_id: int, tick: int, signs: int, out: int, grace
             waiting += data if len(waiting) < _MOST_WAITING else b""
         waiting = _pass_on(out, waiting)
         now = time.monotonic()
-        if os.getppid() != parent or now - alive > grace:  # another process may hold the pipe open
+        if os.getppid() != parent or now - alive > grace:  # the pipe may be open in another process
             return
         if now >= due:
             if not quiet:

@@ -76,7 +76,7 @@ class ParameterSet:
 
 
 class InForce(NamedTuple):
-    """Parameter set in force on a device, rounded to binary32; units as in `ParameterSet`.
+    """Active parameter set on a device, rounded to binary32; units as in `ParameterSet`.
 
     `length`: N of short memory, or the number of exponentials of full memory. `needs`: damping (N·s/m) it requires,
     computed by the device.

@@ -14,7 +14,7 @@ from hilbo.errors import InputError
 __all__ = ["BAUD", "POLL", "Port", "PortInfo", "SerialPort", "SocketPort", "list_ports", "open_port"]
 
 BAUD = 921_600
-"""Line rate (baud) where none is given; a pseudo-terminal and a USB device have none of their own."""
+"""Line rate (baud) where none is given; a pseudo-terminal and a USB device have no rate."""
 POLL = 0.05  # s
 _STUCK = 10.0  # s, write timeout
 _NO_PYSERIAL = "Serial ports need pyserial; install it with: pip install 'hilbo[hardware]'."

@@ -1,6 +1,6 @@
 """Named numbers of firmware/PROTOCOL.md (states, flags, reasons), and messages that explain them to a person.
 
-`sentence` explains a NACK with the numbers it carries: what is wrong, and what to do about it.
+`sentence` explains a NACK with the numbers it carries: the error, and what to do about it.
 """
 
 from enum import IntEnum, IntFlag

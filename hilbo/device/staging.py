@@ -16,9 +16,9 @@ _LONGEST_PAUSE = 0.1  # s between two tries
 
 
 def put_in_force(link: Link, device: HelloReply, wanted: Sequence[SetParams | SetStates], wait: float) -> InForce:
-    """Put a parameter set in force, and return it as the device reports it, compared bit for bit.
+    """Activate a parameter set, and return it as the device reports it, compared bit for bit.
 
-    `wanted`: messages of a `ParameterSet`; they get their number (`set_id`) here. A set that is already in force is not
+    `wanted`: messages of a `ParameterSet`; they get their number (`set_id`) here. A set that is already active is not
     sent again. `wait` (s): timeout for the device to fill the set's history. Raises `RefusalError` if the device
     refuses the set, `DeviceError` after the timeout, or if the device reports another set.
     """
@@ -59,7 +59,7 @@ def retry_while_busy(link: Link, device: HelloReply, message: Message, give_up: 
 
 
 def _confirmed(link: Link, messages: Sequence[SetParams | SetStates]) -> InForce:
-    """Read back the set in force and return it. Raises `DeviceError` if there is none, or it differs from
+    """Read back the active set and return it. Raises `DeviceError` if there is none, or it differs from
     `messages`."""
     reply = link.request(GetSet(bank=0))
     wrong, reported = differences(messages, reply), in_force(reply)

@@ -176,7 +176,7 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence
 
     initial = coordinates_of(gp, options.learn)
     # One search after the other: each stops when converged or near the end of an earlier one; its first evaluation
-    # evidence is sought from the one before's.
+    # evidence is searched from the previous one's.
     no_ends = jnp.full((options.starts, nothing.coordinates.size), jnp.nan, nothing.coordinates.dtype)
     _, ends = jax.lax.scan(ended, (no_ends, nothing), _starting_points(initial, options.starts))
     end = _best(ends, options.starts)

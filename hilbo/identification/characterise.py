@@ -36,7 +36,7 @@ _FILTERED = 4.0  # standard deviations, above which a filter of the force is fit
 class Characterisation(NamedTuple):
     """Results of `characterise`; `estimates` and `bootstrap` by parameter name, `noise` and `nrmse` by kind of test.
 
-    `bootstrap` holds interval ends, None for fewer than 5 repeats; `freedom`: degrees of freedom; `minimum_damping` in
+    `bootstrap` has interval ends, None for fewer than 5 repeats; `freedom`: degrees of freedom; `minimum_damping` in
     N·s/m; `rows`: the fits with other memories.
     """
 

@@ -59,7 +59,7 @@ def ep(covariance: Matrix, terms: Tilted, *, start: Vector | None = None, max_st
 
     - `covariance`: K, (n, n), symmetric, positive semi-definite. Terms that always return 0 (padding) change nothing.
     - `terms`: cavity means and variances (n,) -> L, slopes and precisions, (n,) each; a pytree (e.g. an `eqx.Module`)
-      if it holds arrays that are traced.
+      if it contains arrays that are traced.
     - `start`: `weights` (n,) of an earlier, similar fit (also Laplace's); changes the number of steps, not the result.
     - `max_steps`: largest number of steps of each search.
 

@@ -11,7 +11,7 @@ and the second derivative -C; these give the corrected mean and covariance witho
 
     a becomes a + dR/dh,       C becomes -d2 log Z_EP / dh2 = C - (I - T S) e (I + V)^-1 ... e (I - S T) / 2,
 
-the latter EP's linear response: the derivative of its own mean by h, including the cavities. Both come from the matrix
+the latter EP's linear response: the derivative of its mean by h, including the cavities. Both come from the matrix
 J of EP's Newton steps in one inversion, so that the correction costs little more than two more steps. For Gaussian
 terms e = 0, and nothing changes. For many identical responses the series converges slowly; `docs/methods/inference.md`
 has the errors.

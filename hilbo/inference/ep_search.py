@@ -148,7 +148,7 @@ def _search(
         return hasty & (search.ahead <= 0.1 * search.tolerance)
 
     def unfinished(search):
-        # One step at least: Laplace's mode may be the fixed point, but only to the digits of its own variances.
+        # One step at least: Laplace's mode may be the fixed point, but only to the digits of its variances.
         done = (search.residual <= search.tolerance) & ((search.steps > 1) | (search.residual == 0.0))
         return (search.steps < max_steps) & ~done & ~skips_check(search) & ~jnp.isnan(search.mismatch)
 
@@ -162,7 +162,7 @@ def _initial_without_root(
 ) -> tuple[tuple[Vector, Vector], Int[Array, ""]]:
     """Initial cavity means and variances (n,) for the search without a root, and the number of steps taken for them.
 
-    From `start`; if that is None or holds no start, at Laplace's mode, which is searched in at most 20 steps.
+    From `start`; if that is None or has no start, at Laplace's mode, which is searched in at most 20 steps.
     """
 
     def from_mode():

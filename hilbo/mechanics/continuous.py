@@ -5,7 +5,7 @@ H(s) = K0 + K1·B1·s^α / (K1 + B1·s^α). The force after a unit step of posit
     G(t) = K0 + K1·E_α(-(K1/B1)·t^α)
     J(t) = 1/(K0 + K1) + (K1/(K0 + K1))²/B1 · t^α·E_{α,1+α}(-z),   z = K0·K1/(K0 + K1)/B1 · t^α
 
-The second form of J holds at K0 = 0 too, where creep has no end. Units: N/mm, N·s^α/mm, s, mm/N. Reference: Mainardi
+The second form of J is valid at K0 = 0 too, where creep has no end. Units: N/mm, N·s^α/mm, s, mm/N. Reference: Mainardi
 (2010), Fractional Calculus and Waves in Linear Viscoelasticity, section 3.4.
 """
 

@@ -1,6 +1,6 @@
 """Passivity of a rendering whose force is delayed: the damping needed at each frequency.
 
-Between the sample of the position and its force lies a delay τ, 0 <= τ <= T; then the force is held for T. With σ =
+Between the sample of the position and its force lies a delay τ, 0 <= τ <= T; then the force is constant for T. With σ =
 τ/T, θ = ωT and φ as in `passivity_certificate`, the rendering needs the damping (T/2)·Y(θ) at each frequency,
 
     Y = (ψ + sqrt(ψ² + 4σ(1 - σ)|H|²))/2,   ψ = φ + 2σ·Re(e^{-jθ}·H)

@@ -177,7 +177,7 @@ def _order(span: Span, alpha: Scalar) -> _Order:
 def _material(K1, beta, order: _Order, K_eff) -> _Material:
     """Parameters of a rendering; K1 = 0 or β = 0 is the spring K_eff alone."""
     S = order.sums.at_dc
-    # A spring alone: β = 0, whatever K1 is.
+    # A spring alone: β = 0, for any K1.
     beta = jnp.where(K1 > 0, beta, 0)
     alone = beta == 0
     g, h = jnp.where(alone, 1, share(K1, beta)), jnp.where(alone, 0, share(beta, K1))

@@ -143,9 +143,9 @@ class FOSLS(eqx.Module):
     ) -> Float[Array, " n"]:
         """Force (N) that follows positions `x` (mm), one every T; differentiable in `x` and in every parameter.
 
-        `start`: "rest" at x = 0, or "equilibrium" at x[0], held for ever before. `unilateral`: contact can only push: x
-        below 0 counts as 0 in the history, and forces below 0 as 0. `block` = 1 is the plain recursion, sample by
-        sample; larger blocks give the same numbers up to rounding, faster. `x` (n,) -> (n,). Raises `InputError` for
+        `start`: "rest" at x = 0, or "equilibrium" at x[0], constant for ever before. `unilateral`: contact can only
+        push: x below 0 counts as 0 in the history, and forces below 0 as 0. `block` = 1 is the plain recursion, sample
+        by sample; larger blocks give the same numbers up to rounding, faster. `x` (n,) -> (n,). Raises `InputError` for
         another shape or an unknown `start`.
         """
         return _force(self, self._series("x", x), _checked_start(start), unilateral, block)
@@ -163,7 +163,8 @@ class FOSLS(eqx.Module):
     def _series(self, name: str, value: Real[ArrayLike, " n"]) -> Float[Array, " n"]:
         """Samples as an array of the model's dtype.
 
-        Raises `InputError`, with the `name` of the argument, for what is not numeric or has another shape than (n,).
+        Raises `InputError`, with the `name` of the argument, for values that are not numeric or have another shape than
+        (n,).
         """
         samples = numbers("FOSLS", name, value, self.K0.dtype)
         if samples.ndim != 1:

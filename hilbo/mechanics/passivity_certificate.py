@@ -11,9 +11,9 @@ damping, for even N as well as odd. A delayed force needs (T/2)·Y(θ) of `delay
 
 With full memory the Nyquist frequency binds (docs/methods/mechanics.md), and b_min has a closed form.
 
-A violation is shown in time, by a path that loses least in the device's damping. The force is held, so that between
-samples the path is straight, and a cycle absorbs the energy Σ F_n·Δx_n + b·Δx_n²/T: negative if it creates energy. A
-delayed force changes between the samples, and there the path has a bend.
+A violation is shown in time, by a path that loses least in the device's damping. The force is constant between samples,
+so that between samples the path is straight, and a cycle absorbs the energy Σ F_n·Δx_n + b·Δx_n²/T: negative if it
+creates energy. A delayed force changes between the samples, and there the path has a bend.
 
 Units: damping N·s/m, ω rad/s, x mm, F N, energy mJ (N·mm). Reference: Colgate and Schenkel (1997), J. Robotic Syst. 14,
 37-47.
@@ -80,7 +80,7 @@ class Certificate(eqx.Module):
 class Witness(eqx.Module):
     """Cycle that creates energy: `x` (mm) at its n + 1 samples, forces (N) of the first n, energies (mJ).
 
-    Each force is held for T from `delay` (s) after its sample, when x is `bend` (mm); x is linear in between.
+    Each force is constant for T from `delay` (s) after its sample, when x is `bend` (mm); x is linear in between.
     """
 
     force: Float[np.ndarray, " n"]

@@ -1,7 +1,7 @@
 """Change of the parameter set while the device is in contact.
 
 The history of one set is no valid history of another: clearing it makes the force jump by newtons, and rescaling it is
-wrong in motion. So the new set runs a history of its own on the same positions from the moment it is staged; once that
+wrong in motion. So the new set runs a separate history on the same positions from the moment it is staged; once that
 is filled, the force switches to it, with the difference d of the two forces added and then reduced at a bounded rate:
 
     F_n = F_old,n                                          n < flip
@@ -27,8 +27,8 @@ def switched_force(
     """Force (N) along positions `x` (mm) when `new` is staged at sample `staged` and takes over at sample `flip`.
 
     At `flip` the difference of the two forces is added to the new one and then reduced by `slew` (N/s). The new history
-    starts as if x[staged] had been held for ever. Raises InputError for samples out of order or of range, a `slew` that
-    is not above 0, and sets for different sampling times. `x` (n,) -> (n,).
+    starts as if x[staged] had been constant for ever. Raises InputError for samples out of order or of range, a `slew`
+    that is not above 0, and sets for different sampling times. `x` (n,) -> (n,).
     """
     x = jnp.asarray(x, old.K0.dtype)
     if not 0 <= staged <= flip < x.shape[0]:

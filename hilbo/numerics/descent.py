@@ -67,7 +67,7 @@ def descended(
     try:
         end = minimize(evaluated, begin, jac=True, method="L-BFGS-B", bounds=bounds, callback=count, options=options)
         ended = bool(end.success)
-    except _NotFiniteError:  # L-BFGS-B does not turn back where the value is infinite: it would say that it has ended
+    except _NotFiniteError:  # L-BFGS-B does not turn back where the value is infinite: it would report convergence
         ended = False
     return Descent(lowest.aux, steps, ended)
 

@@ -1,6 +1,6 @@
 """Functions that compute with NumPy or with JAX, and the transfer of values to the device.
 
-Outside of a trace every operation of JAX on a new shape is a program of its own: it takes ten milliseconds to trace,
+Outside of a trace every operation of JAX on a new shape is a separate program: it takes ten milliseconds to trace,
 lower and load, and nothing to run. Small computations are therefore done by NumPy.
 """
 
@@ -43,10 +43,10 @@ def scan(step: Callable[[Any, Any], Any], start: Any, over: Any) -> Any:
 
 
 def to_device(value: Any, dtype: Any = None) -> Any:
-    """Convert a value to a JAX array, of its own dtype or `dtype`.
+    """Convert a value to a JAX array, of its dtype or `dtype`.
 
     Values of NumPy or Python are copied, and nothing is compiled; a value that contains JAX arrays goes to
-    `jnp.asarray`. Raises `TypeError` or `ValueError` for what is no numeric array.
+    `jnp.asarray`. Raises `TypeError` or `ValueError` for values that are not numeric arrays.
     """
     import jax
 

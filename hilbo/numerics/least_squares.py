@@ -1,7 +1,7 @@
 """Nonlinear least squares in a box, for few parameters and many residuals: Levenberg-Marquardt on normal equations.
 
 Minimise |r(q)|² over lower <= q <= upper. A step solves (JᵀJ + λ diag JᵀJ) d = -Jᵀr in the free parameters only: those
-that are not held at a bound by the gradient, nor fixed by lower = upper. It is cut off at the box and taken if it
+that are not at an active bound, nor fixed by lower = upper. It is cut off at the box and taken if it
 improves. The Jacobian is exact (forward mode) and only its products of size (p, p) leave an evaluation, so that the
 solver maps over starts, fixed values and data sets, and a fixed parameter is the same compiled function.
 Normal equations square the condition number; `identification` chooses coordinates in which it is about 30.
@@ -118,7 +118,8 @@ def _judged(state: _State, q: Float[Array, " p"], trial: _Evaluation, tiny: Arra
 
 
 def _direction(state: _State, lower: Float[Array, " p"], upper: Float[Array, " p"]) -> Float[Array, " p"]:
-    """Damped step (p,) of the free parameters; 0 for parameters that are fixed, held at a bound, or without effect."""
+    """Damped step (p,) of the free parameters; 0 for parameters that are fixed, at an active bound, or without
+    effect."""
     held = ((state.q <= lower) & (state.gradient >= 0)) | ((state.q >= upper) & (state.gradient <= 0))
     free = ~held & (lower < upper)
     size = jnp.diag(state.normal)

@@ -3,7 +3,7 @@
 jaxlib's batched LAPACK kernels wait for the thread pool from inside that pool. If two of them are ready at once, all
 workers of a small machine can deadlock (seen with jaxlib 0.10 on two cores: every worker in `ParallelBatchMap`). A
 kernel on one matrix does not wait. Under `jax.vmap` these functions therefore loop over the matrices on a CPU, and stay
-batched on other devices. They are not differentiable; their callers have derivative rules of their own.
+batched on other devices. They are not differentiable; their callers define derivative rules.
 """
 
 from collections.abc import Callable

@@ -64,12 +64,12 @@ class _State(eqx.Module):
     move: Float[Array, " p"]  # the next step,
     promised: Float[Array, ""]  # and by how much it lowers the quadratic model
     radius: Float[Array, ""]
-    pressing: Float[Array, ""]  # largest component of the gradient that no wall holds
-    ahead: Float[Array, ""]  # by how much the model falls within a radius of 1, whatever the radius is
+    pressing: Float[Array, ""]  # largest component of the gradient without active walls
+    ahead: Float[Array, ""]  # decrease of the model within a radius of 1, for any radius
 
 
 class TrustRegionNewton(optx.AbstractMinimiser):
-    """Trust-region Newton minimiser for `optimistix.minimise`. `options` may hold
+    """Trust-region Newton minimiser for `optimistix.minimise`. `options` may contain
 
     - "lower" and "upper": bounds, each like the variables;
     - "walls" (a `Polytope`) and "held": instead of bounds, linear walls within the unit cube, and which variables stay
@@ -177,7 +177,7 @@ def _plan_between(
     touching = seen.offsets <= _TOUCHES
     corner = Polytope(jnp.where(touching[:, None], seen.normals, 0.0), jnp.where(touching, 0.0, 1.0))
     downhill = nearest(corner, jnp.where(held, 0.0, -expansion.gradient), plain)
-    pressing = -downhill.point  # what is left of the gradient where walls hold
+    pressing = -downhill.point  # projected gradient at active walls
     hessian = jnp.where(held[:, None] | held[None, :], plain, expansion.hessian)
     free = projector(seen.normals, downhill.multipliers > 0.0)
     eigenvalues, vectors = eigh(free @ hessian @ free + (plain - free))

@@ -62,7 +62,7 @@ class _Turned(NamedTuple):
 
     normals: Float[Array, "k d"]
     sizes: Float[Array, " k"]  # of the normals
-    usable: Bool[Array, " k"]  # what has a normal
+    usable: Bool[Array, " k"]  # walls with a normal
     beyond: Float[Array, " k"]  # how far the target is beyond each wall
     tolerance: Float[Array, " k"]
 

@@ -67,7 +67,7 @@ def sum_over_people(term: Callable[..., Any], people: PyTree, *shared: Any) -> A
 def _on_devices(function: Callable[..., Any], out: PartitionSpec) -> Callable[[PyTree, tuple[Any, ...]], Any]:
     """Function `(people, shared)` that runs `function(people, *shared)` on each device for its own rows of people.
 
-    `out`: how the results are laid out over the devices. What is no array in `shared` is passed as it is.
+    `out`: how the results are laid out over the devices. Non-arrays in `shared` are passed unchanged.
     """
 
     def call(people, shared):

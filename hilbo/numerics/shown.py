@@ -42,9 +42,9 @@ def floats(array: Any, dtype: DTypeLike | None = None) -> Any:
 
 
 def numbers(whose: str, name: str, value: Any, dtype: DTypeLike | None = None) -> jax.Array:
-    """Convert a value to a JAX array, of its own dtype or `dtype`. Raises `InputError` if that is impossible.
+    """Convert a value to a JAX array, of its dtype or `dtype`. Raises `InputError` if that is impossible.
 
-    That is so for what is not numeric and for rows of different lengths. `whose` and `name` begin the message.
+    It is for values that are not numeric and for rows of different lengths. `whose` and `name` begin the message.
     """
     try:
         return to_device(value, dtype)

@@ -29,7 +29,8 @@ OfArrays = Callable[[Sequence[Any]], Any]
 """A program as a function of a call's arrays, in the order of `jax.tree.leaves`."""
 
 Keeper = Callable[[Callable, tuple, dict[str, Any]], OfArrays | None]
-"""Finds the program of a call, or makes it: of what was traced, and the call's arguments. None: it cannot be kept."""
+"""Finds the program of a call, or makes it, from the traced function and the call's arguments. None: it cannot be
+cached."""
 
 _keepers: list[Keeper] = []
 

@@ -108,7 +108,7 @@ def _derivatives(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tup
     """
     f, lower, upper, noise = primals
     out = truncated_normal(f, lower, upper, noise)
-    # An infinite edge has density 0 and does not move; f stands in for it so that no 0 * inf arises, at any order.
+    # An infinite edge has density 0 and does not move; f replaces it so that no 0 * inf arises, at any order.
     a = (jnp.where(jnp.isinf(lower), f, lower) - f) / noise
     b = (jnp.where(jnp.isinf(upper), f, upper) - f) / noise
     shift = tangents[0] / noise

@@ -62,7 +62,7 @@ class RuleMap(eqx.Module):
 
     rule: str = eqx.field(static=True)
     method: str = eqx.field(static=True)
-    """ "by points" from everybody's posterior, or "exact" from all answers at once."""
+    """ "by points" from each participant's posterior, or "exact" from all answers at once."""
     experts: Posterior | None
     """Stacked, one for each person, of a map by points."""
     shared: Posterior | None
@@ -71,7 +71,7 @@ class RuleMap(eqx.Module):
     prior: Float[Array, ""]
     """Prior variance of one person's function."""
     reach: Float[Array, ""] | None = None
-    """By a recipe the largest variance of the map where somebody answered: beyond it no optimum is sought."""
+    """Of a versioned method the largest variance of the map at a tested stimulus: beyond it no optimum is searched."""
     scale: ScaleUse | None = None
     """How people differ in the use of the scale; None if they do not."""
     centred: bool = eqx.field(static=True, default=False)

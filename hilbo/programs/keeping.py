@@ -73,7 +73,7 @@ class Programs:
                 with self._finding.setdefault(key, threading.RLock()):
                     if key not in self._known:
                         self._known[key] = self._find(function, args, kwargs)
-        except TypeError:  # something that cannot be hashed; what is wrong with the call itself is met again there
+        except TypeError:  # an unhashable argument; an error of the call itself is raised again there
             return None
         return self._known[key]
 
@@ -120,9 +120,9 @@ class Programs:
             ready = _ready(entry)
             if _bits(ready.run(*arrays)) != _bits(compiled(*arrays)):
                 return None
-        except Exception:  # it cannot be written; a mistake of its own is met again when it is compiled
+        except Exception:  # it cannot be written; an error of the function is raised again when it is compiled
             return None
-        if code_digest(self._package) == self._code:  # else somebody edits it while this runs
+        if code_digest(self._package) == self._code:  # else it is edited while this runs
             self._entries.write(entry)
         return ready
 

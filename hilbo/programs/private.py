@@ -1,4 +1,4 @@
-"""Whether what is in a cache may be executed: only what no other user can have written."""
+"""Whether the content of a cache may be executed: only files that no other user can have written."""
 
 import contextlib
 import os

@@ -11,13 +11,13 @@ from pathlib import Path
 __all__ = ["code_digest", "surroundings"]
 
 _COMPUTE = ("jax", "jaxlib", "equinox", "lineax", "optimistix", "jaxtyping", "numpy", "scipy")
-_ELSEWHERE = ("cache", "log", "debug_info", "dump")  # settings that say where something is written, not what
+_ELSEWHERE = ("cache", "log", "debug_info", "dump")  # settings of output paths, without influence on results
 
 
 def surroundings() -> str:
     """Text that differs whenever the same code might compile to another program.
 
-    It holds versions, processor, devices, flags of XLA and JAX in the environment, and JAX's settings. Initialises
+    It contains versions, processor, devices, flags of XLA and JAX in the environment, and JAX's settings. Initialises
     JAX's devices.
     """
     import jax

@@ -12,7 +12,7 @@ __all__ = ["passivity_result", "passivity_words"]
 def passivity_result(model: FOSLS, b: float, delay: float = 0.0) -> dict[str, Any]:
     """The content of result.json of `hilbo passivity`: status, margin, binding frequency, largest K1, a witness.
 
-    `b`: damping of the device, N·s/m. The status holds for every delay of the force up to `delay` (s), as a device
+    `b`: damping of the device, N·s/m. The status is valid for every delay of the force up to `delay` (s), as a device
     checks its sets and a study its space: the needed damping first falls with the delay and then rises, so that it is
     largest either without delay or at `delay`; `binding_delay` is that one. `margin`: lower and upper bound, N·s/m;
     `binding_frequency` in Hz; `largest_K1` in N/mm, None where every K1 is passive (`every_K1`) and for even N;

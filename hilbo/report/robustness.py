@@ -24,7 +24,7 @@ from hilbo.study.robustness.robustness import LIMIT, NEAR, Place, Robustness
 
 __all__ = ["gp_table", "robustness_page", "robustness_result", "write_robustness"]
 
-_TENTH = 0.1  # of every search range: two renderings that a person would hardly tell apart
+_TENTH = 0.1  # of every search range: distance of two hardly discriminable stimuli
 _UNRELATED = 0.1
 
 

@@ -244,7 +244,7 @@ def write_validation(
 ) -> Content:
     """Write the results of `hilbo validate` into an existing folder; return the content of result.json.
 
-    With several materials the tables and figures of each go to a folder of its own within it. `path`, `sets`: files of
+    With several materials the tables and figures of each go to a separate folder within it. `path`, `sets`: files of
     the validation table and of the sets table, or None; `material`: the only one to analyse, None: all; `seed`: only
     recorded; `say`: called with a text at each step. Raises `InputError` for invalid tables.
     """

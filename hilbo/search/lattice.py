@@ -97,7 +97,7 @@ class Screened(NamedTuple):
     """The highest value; and points (1 + c + p, d) from which to search on, with their hopes (1 + c + p,).
 
     First the highest point itself, with hope infinity; then the most hopeful one of each column, -inf for columns that
-    cannot hold the maximum; then the extra points. Where nothing may be asked, all are -inf.
+    cannot contain the maximum; then the extra points. Without feasible points all are -inf.
     """
 
     value: Float[Array, ""]
@@ -260,7 +260,7 @@ class _Values(eqx.Module):
         """Values and hopes (m,) for prior covariances `cross`; -inf if the score is not a number."""
         product = jnp.concatenate([self.factor, self.weights[None, :]]) @ jax.lax.optimization_barrier(cross)
         mean, left = product[-1], self.prior - jnp.sum(product[:-1] ** 2, axis=0)
-        # Rounding may leave less than nothing of a variance, and these numbers only rank; what is none ranks last.
+        # Rounding may leave less than nothing of a variance, and these numbers only rank; NaN ranks last.
         value = self.score(mean, jnp.where(left > 0, left, 0.0))
         possible = value > -jnp.inf
         hope = value + _PROMISE * (self.score.optimistic(mean, self.prior) - value)

@@ -87,7 +87,7 @@ def derived_of(
 def _K0_and_margin(space: SearchSpace, physical: Float[Array, " d"]) -> Float[Array, "2"]:
     """K0 (N/mm) and the passivity margin (N·s/m) of a physical point (d,), as (2,); for a space with mechanics."""
     derived, margin = derived_of(space, physical)
-    assert margin is not None  # only asked for with mechanics
+    assert margin is not None  # only used with mechanics
     return jnp.stack([derived["K0"], margin])
 
 

@@ -50,7 +50,7 @@ class SearchSpace(eqx.Module):
     """Named parameters; with `mechanics` the passive part of their box, with `constraints` what they leave.
 
     With mechanics the parameters must include K1 (N/mm), B1 (N·s^α/mm) and alpha, in any order. Raises InputError if no
-    column (B1, alpha) holds a passive K1, or if the constraints leave nothing. So do methods for points with another
+    column (B1, alpha) has a passive K1, or if the constraints leave nothing. So do methods for points with another
     number of coordinates.
     """
 
@@ -59,13 +59,13 @@ class SearchSpace(eqx.Module):
     constraints: tuple[Constraint, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
-        Box(self.parameters, self.mechanics, self.constraints)  # refuses what is no box
+        Box(self.parameters, self.mechanics, self.constraints)  # refuses invalid bounds
         if self.mechanics is not None:
             check_volume(self._passive)
         if self.constraints:
             linear.check_room(self.parameters, self.constraints)
             if self.mechanics is not None or any(self.discrete):
-                self.candidates(1, 0)  # or says that nothing is left
+                self.candidates(1, 0)  # or reports an empty space
 
     @property
     def dim(self) -> int:

@@ -59,7 +59,7 @@ def latin_chunks(dim: int, count: int, seed: int) -> Chunks:
 def wall_chunks(dim: int, count: int, seed: int) -> Chunks:
     """Yield without end chunks that fix coordinates of points: 0 or 1 for one or more random ones, NaN for the others.
 
-    `HELD` holds the shares of points with one, two and three fixed coordinates. The first chunk has `count` rows.
+    `HELD` contains the shares of points with one, two and three fixed coordinates. The first chunk has `count` rows.
     """
     rng = np.random.default_rng(seed)
     shares = np.array(HELD[:dim]) / sum(HELD[:dim])

@@ -39,7 +39,7 @@ def simulate_folder(
     folder: Path, preset: str | None, count: int, seed: int, source: Path | None = None
 ) -> tuple[Simulated, ...]:
     """Simulate `count` participants and write trials.csv, truth.csv and study.toml to an existing folder, over existing
-    files. Of a study with materials each has `count` participants of its own (P01 of one is not P01 of another), and
+    files. Of a study with materials each has `count` separate participants (P01 of one is not P01 of another), and
     the tables have a column `material`.
 
     `preset`: name of the population, as in `population_of`. `source`: a study file instead of the paper's. Raises

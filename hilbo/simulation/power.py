@@ -1,9 +1,9 @@
 """How many participants and trials a study needs for a given error: from simulated studies whose truth is known.
 
 Studies are simulated once, at the largest numbers asked for, M people and n trials each. Of a study's people the first
-m are a study of m people, since people are drawn independently; of everybody's trials the first t are what a session
-of t trials would have asked and heard, since a session looks back only. Criteria drift by the trial (the population's
-drift over the study's own number of trials), so that a short session drifts less.
+m are a study of m people, since people are drawn independently; of each participant the first t trials are those of a
+session of t trials would have asked and heard, since a session looks back only. Criteria drift by the trial (the
+population's drift over the study's own number of trials), so that a short session drifts less.
 
 For every (m, t) a study is aggregated by the study's rule, and two errors are taken:
   optimum: NRMSE of the population optimum to the truth, in units of the search ranges;
@@ -150,7 +150,7 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
     most, longest = max(plan.participants), max(plan.trials)
     seed = int(np.random.default_rng([plan.seed, index]).integers(2**31))
     staged = _with_trials(study, longest)
-    # A drift over the study's own session, told per trial, is this much over the longest one.
+    # A drift over the study's session, specified per trial, is this much over the longest one.
     scale = longest / study.file.selection.trials
     population_ = with_truth(study, population_, seed)
     persons = people(staged, population_, most, seed)

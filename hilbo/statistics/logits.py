@@ -92,7 +92,7 @@ def tied_preferences(
     """Strengths of sets from paired comparisons with ties, by the model of Rao & Kupper (1967).
 
     P(a beats b) = σ(λ_a - λ_b - η), P(b beats a) = σ(λ_b - λ_a - η), the rest are ties: an ordered logit with edges
-    ∓η. Without ties η = 0 and it is Bradley & Terry's model. `preferred` holds one of the two sets or "tie" for each
+    ∓η. Without ties η = 0 and it is Bradley & Terry's model. `preferred` is one of the two sets or "tie" for each
     comparison; the strength of `reference` (default: the last in the alphabet) is 0. `order` (+1 if `first` was shown
     first, -1 if not, 0 if not known) adds the term "shown first".
     All sequences are (n,), one entry a comparison. Raises `InputError` for a preference that is neither set nor a tie,

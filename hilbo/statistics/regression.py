@@ -43,7 +43,7 @@ class Regression(eqx.Module):
 
     `table` has one row per coefficient and kind of error: `term`, `estimate`, `errors`, `std_error`, `statistic`,
     `degrees_of_freedom`, `p_value` (of 0), `low`, `high`, `odds_ratio`, `odds_low`, `odds_high`, `assumes`.
-    `covariances` holds the covariance of the finite estimates by kind of error, `clusters` the number of clusters by
+    `covariances` contains the covariance of the finite estimates by kind of error, `clusters` the number of clusters by
     each way, `warnings` one sentence for each thing to know before the table is believed.
     """
 

@@ -38,7 +38,7 @@ _CATEGORIES = "hilbo's column category"
 class Cohort(eqx.Module):
     """The responses of M participants, padded to one capacity (the number of slots per participant).
 
-    `trials` is stacked, (M, capacity, ...), with a mask of the slots in use; `physical` (M, capacity, d) holds the same
+    `trials` is stacked, (M, capacity, ...), with a mask of the slots in use; `physical` (M, capacity, d) has the same
     points in physical units (levels by index), NaN in unused slots. `names`: participants' ids.
     """
 

@@ -24,7 +24,7 @@ __all__ = ["RBF", "OrdinalGP", "OrdinalProbit", "Study"]
 class Study(eqx.Module):
     """A checked study file with its search space and its model.
 
-    `gp` holds arrays and may be differentiated; all other fields but `learnt` are static.
+    `gp` has array fields and may be differentiated; all other fields but `learnt` are static.
     """
 
     gp: OrdinalGP

@@ -24,7 +24,7 @@ class Included(NamedTuple):
 
 def included(study: Study, everybody: Cohort) -> Included:
     """Apply the study's exclusion rule to a cohort; computes the response quality of every participant. Raises
-    `InputError` if nobody is left."""
+    `InputError` if no participant is left."""
     people = measure_people(study.gp, everybody.trials, everybody.names)
     left_out = excluded(people, study.file.exclude)
     if len(left_out) == len(everybody.names):

@@ -7,9 +7,10 @@
     truth.csv         optional, of a simulated study: the true parameters, in a row of `source` "population"
     plan.json         optional: the plan of `hilbo plan`, or several as plan-*.json, with which sessions are compared
 
-The folder of `hilbo export` is one: its data/ holds trials, validation, sets, and sessions (for the plan) by the names
-of a Psych-DS. A study of several materials names them in [materials.NAME] (which overrides the renderer or parameters)
-or in the tables' column `material` alone, when they share everything. Every mistake is one sentence with its file.
+The folder of `hilbo export` is one: its data/ contains trials, validation, sets, and sessions (for the plan) by the
+names of a Psych-DS. A study of several materials names them in [materials.NAME] (which overrides the renderer or
+parameters) or in the tables' column `material` alone, when they share everything. Every mistake is one sentence with
+its file.
 """
 
 import json

@@ -65,7 +65,7 @@ def test_nothing_is_overwritten(folder, capsys, monkeypatch):
     ("text", "sentence"),
     [
         ("", "export.csv: is empty"),
-        ("participant;hue\nA;150,5\n", "no column is known to hold the parameter light"),
+        ("participant;hue\nA;150,5\n", "no column is recognised as the parameter light"),
         ("participant,response,hue,light\nA,close,150", "export.csv:2: has 3 cells, the header has 4"),
         ('participant,response,hue,light\nA,"close" one,150,40', "export.csv:2: has a quotation mark"),
         ("participant,response,hue,light\nA,close,999,40", "export.csv:2: hue is"),

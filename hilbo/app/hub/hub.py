@@ -3,7 +3,7 @@
     page or program --> answer / press / command --> event --> log (fsync) --> state --> views to all pages
 
 Events are made one at a time, and an event counts only once it is on the disk: then the state advances, the sender gets
-its response, and the next trial is proposed. Beside the event loop there are threads for the disk, a device
+its response, and the next trial is proposed. In addition to the event loop there are threads for the disk, a device
 (`device_rig`), the choice of trials and the map. `runner` presents the trials, `interruptions` handles what interrupts
 them.
 """
@@ -61,7 +61,7 @@ class Hub:
         self.log, self.chooser, self.tag, self.gap = log, chooser, tag, gap
         self.state: LiveSession = log.state
         self._rig: Rig | None = None
-        self.begun = False  # whether the participant has said so, since the server started or the page came back
+        self.begun = False  # whether the participant has pressed Begin, since the server started or the page came back
         self.alert: str | None = None
         self.lost = False  # whether the log's file is lost: the session has ended
         self.without_map = ""  # why, in a sentence
@@ -104,7 +104,7 @@ class Hub:
             maps = self._make_maps(self.chooser)
             maps.warm()
             self._maps = maps
-        except Exception as error:  # whatever it is: a person is waiting, and the session needs no map
+        except Exception as error:  # any error: a person is waiting, and the session needs no map
             why = " ".join(str(error).split())[:_WHY]
             self.without_map = f"There will be no map ({why}); the session goes on without it."
 
@@ -160,7 +160,7 @@ class Hub:
         log, apply it, notify the pages, and return it; None, with nothing written, if it makes none. One commit runs at
         a time.
 
-        The runner is restarted if the event changes what is to be presented, unless `mine` says that the runner itself
+        The runner is restarted if the event changes the next presentation, unless `mine` says that the runner itself
         asks. Raises what `make` raises (`RefusedError`), and `LogError` if the event is not on the disk. A cancelled
         caller does not cancel the commit, so that log and state always agree.
         """
@@ -334,7 +334,7 @@ class Hub:
             raise NotNowError("This trial is not of this session.")
         return int(trial), int(presentation)
 
-    # What the rig's thread tells.
+    # Callbacks of the rig's thread.
 
     def _from_rig(self, seen: Snapshot) -> None:
         """Hand a new snapshot, from the rig's thread, to the event loop."""

@@ -25,7 +25,7 @@ __all__ = ["Interruptions", "interrupt"]
 
 _STOPPED = {"HOLD": "hold", "ESTOP": "estop"}
 _LATER = 1.0  # s between two looks at the clock
-_JUMP = 3.0  # s by which the clock, or the wait for it, may be off before somebody must have closed the laptop
+_JUMP = 3.0  # s by which the clock, or the wait for it, may be off before the laptop must have been closed
 _GONE = 3.0  # s without a participant's page until a trial that is being felt is begun again
 
 
@@ -76,7 +76,7 @@ class Interruptions:
         return next(iter(self._faults.values()), None)
 
     def device_changed(self, seen: Snapshot) -> None:
-        """Handle a new snapshot of the rig in a task of its own: log a changed condition as an event of the trial that
+        """Handle a new snapshot of the rig in a separate task: log a changed condition as an event of the trial that
         is pending now, and notify the pages."""
         self._spawn(self._device_changed(seen))
 
@@ -131,7 +131,7 @@ class Interruptions:
 
     async def _watch(self, what: str, look: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Call `look` every `_LATER` s until cancelled, also after it failed, and set or clear its fault under the name
-        `what`. Each watch is a task of its own: a slow disk must not look like a laptop that slept."""
+        `what`. Each watch is a separate task: a slow disk must not look like a laptop that slept."""
         while True:
             await asyncio.sleep(_LATER)
             try:

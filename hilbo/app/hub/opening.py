@@ -187,7 +187,7 @@ def _as_asked(wanted: Wanted, header: Header) -> Header:
     """A planned header with the session label of the options, if there is one. Raises `InputError` if the options have
     another seed or material than the plan.
 
-    With a label of its own, a session that was ended by accident can be run again by the same plan.
+    With a separate label, a session that was ended by accident can be run again by the same plan.
     """
     where = f"{wanted.plan}: plans the session of {wanted.participant}"
     if wanted.seed not in (None, header.seed):

@@ -1,6 +1,6 @@
 """The task that presents trials: propose, prepare, present step by step, wait for the answer.
 
-It is restarted whenever an event changes what is to be presented (an answer, a break, an undo, a HOLD …). The rig
+It is restarted whenever an event changes the next presentation (an answer, a break, an undo, a HOLD …). The rig
 prepares a rendering while the reference or nothing is presented, and a step begins when the rig reports that it is
 presented. Nothing is presented before Begin, nor during compilation; otherwise the rig rests. A hand that blocks the
 start of a rendering is asked to leave; if it stays, the presentation is interrupted. During a presentation the next
@@ -24,7 +24,7 @@ __all__ = ["Runner"]
 
 _LATER = 1.0  # s until what the device refused is tried again
 _SOON = 0.05  # s
-_HAND = 0.15  # s that a hand may keep a rendering from being shown before it is asked to leave
+_HAND = 0.15  # s in contact before the page asks the hand to leave
 _LEAVES = 20.0  # s that it may stay after that, until the presentation is interrupted
 
 
@@ -48,7 +48,7 @@ class Runner:
         self.clock: dict[str, float] = {}
         self._task: asyncio.Task | None = None
         self._stop = asyncio.Event()
-        self._asked: float | None = None  # when the hand was asked to leave, monotonic
+        self._asked: float | None = None  # time of the request to leave, monotonic
         self._in_force: tuple[int, int, str] | None = None
         self._showing: Showing | None = None  # the last request
         self._differs = False  # whether the rig ever presented another rendering than requested
@@ -81,7 +81,7 @@ class Runner:
         self._wake.set()
 
     def forget(self) -> None:
-        """Record that the rig has no rendering in force, so that the next one is prepared again."""
+        """Record that the rig has no active stimulus, so that the next one is prepared again."""
         self._in_force = None
 
     async def _run(self, stop: asyncio.Event) -> None:
@@ -96,10 +96,10 @@ class Runner:
                 self._schedule_restart(stop)
             except HandError as error:
                 await interrupt(self.hub, str(error))
-        except RefusedError:  # the state has changed meanwhile, and with it what is to be done
+        except RefusedError:  # the state has changed meanwhile, and with it the next step
             await asyncio.sleep(_SOON)
             self._schedule_restart(stop)
-        except Exception as error:  # whatever it is, the experimenter is told, and it is tried again
+        except Exception as error:  # any error is shown to the experimenter, and it is tried again
             self.trouble = str(error) or type(error).__name__
             self._at("trouble")
             await asyncio.sleep(_LATER)
@@ -123,7 +123,7 @@ class Runner:
                 await self._propose()
             else:
                 trial = hub.state.pending
-                assert trial is not None  # as the screen says
+                assert trial is not None  # as on the screen
                 if await self._warm_up_due() or not await self._present(trial):
                     continue
                 return
@@ -246,14 +246,14 @@ class Runner:
         return await work
 
     def _loading(self, trial: Trial, side: str | None) -> asyncio.Task:
-        """A background task of `_load`; if nobody awaits it, its exception is dropped."""
+        """A background task of `_load`; if it is not awaited, its exception is dropped."""
         task = asyncio.ensure_future(self._load(trial, side))
         task.add_done_callback(_retrieve_exception)
         return task
 
     async def _load(self, trial: Trial, side: str | None) -> None:
-        """Have the rig prepare a side ("a" or "b") of a trial, and log it if the rig then has it in force. Nothing for
-        None, or for a side in force already."""
+        """Have the rig prepare a side ("a" or "b") of a trial, and log it if the rig then has it active. Nothing for
+        None, or for a side active already."""
         if side is None or self._in_force == (trial.id, trial.presentation, side):
             return
         self._in_force = None  # unknown until this one is
@@ -264,8 +264,8 @@ class Runner:
             self._in_force = (trial.id, trial.presentation, side)
 
     async def _log_in_force(self, trial: Trial, side: str, loaded: Loaded) -> None:
-        """Log that a side is in force, with the rig's facts, and record the delay. If what is presented differs from
-        what was requested, the proposals computed in advance are computed again."""
+        """Log that a side is active, with the rig's facts, and record the delay. If the confirmed values differ from
+        the requested ones, the proposals computed in advance are computed again."""
         self._note_times(loaded)
         await self.hub.commit(lambda state, at: actions.sent(state, trial.id, side, at, **loaded.facts), mine=True)
         now = self.hub.state.trial(trial.id)
@@ -289,7 +289,7 @@ class Runner:
         hub.begun = False
 
     def _note_times(self, loaded: Loaded) -> None:
-        """Append the times (s) from the last answer to this rendering in force, by part, to `hub.delays`, if it follows
+        """Append the times (s) from the last answer to this active stimulus, by part, to `hub.delays`, if it follows
         an answer; then forget that answer."""
         clock, now = self.clock, time.perf_counter()
         if {"came", "chosen", "proposed"} <= set(clock):

@@ -1,7 +1,7 @@
 """The view of an experimenter who must not know the parameters: progress, answers, and labels of renderings.
 
-Only what can hold no parameter is copied from the full view: names of sets, choices, predictions, confirmed values,
-reasons that state values and what a device sends unasked are left out. Each rendering has a label
+Only fields that cannot contain a parameter are copied from the full view: names of sets, choices, predictions,
+confirmed values, reasons that state values and what a device sends unasked are left out. Each rendering has a label
 (`set_codes.label_of`), the same that the preparer sees.
 """
 
@@ -64,7 +64,7 @@ def _table(hub: HubInterface, rows: list[View]) -> View:
 
 
 def _unvalued(event: Event) -> Event:
-    """A copy of an event without what may state a value or the name of a set."""
+    """A copy of an event without values and names of sets."""
     data = {key: value for key, value in event.data.items() if key not in ("sets", "choice")}
     if event.kind == "missed":
         data["reason"] = str(data["reason"]).partition(":")[0]

@@ -153,7 +153,7 @@ _SENTENCES: dict[str, Callable[[LiveSession, str, _Data], str]] = {
 
 
 def table(state: LiveSession) -> dict[str, Any]:
-    """Head and rows of the table of trials, newest first: name, answer, remark, and what was presented: the names of
+    """Head and rows of the table of trials, newest first: name, response, remark, and the stimuli: the names of
     the sets if all trials were planned, else the value of each parameter."""
     parameters = state.study.space.parameters
     chosen = any(not trial.sets for trial in state.trials)

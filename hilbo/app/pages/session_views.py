@@ -1,6 +1,6 @@
 """The participant's and the experimenter's view of a session, as plain dicts for JSON.
 
-The participant's view holds no parameter, no name of a set and no prediction: it is built from the protocol and its
+The participant's view contains no parameter, no name of a set and no prediction: it is built from the protocol and its
 texts, never by removing something from the experimenter's.
 """
 
@@ -109,7 +109,7 @@ def _progress(state: LiveSession) -> View:
 
 def experimenter_view(state: LiveSession) -> View:
     """The whole state as a dict for JSON, parameters included, for the experimenter's page and for programs; without
-    the study file, which the log holds."""
+    the study file in the log."""
     header = state.header
     return {
         "study": {"name": state.study.name, "hash": state.study.hash, "responses": list(state.study.responses)},

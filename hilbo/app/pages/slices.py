@@ -26,7 +26,7 @@ from hilbo.study.config import Study
 __all__ = ["Maps"]
 
 _SIDE = 33
-_ANSWER = "answer given"  # what is up where there is one parameter
+_ANSWER = "answer given"  # vertical axis of a map with one parameter
 _Pair = tuple[int, int | None]  # of parameters, across and up
 
 

@@ -1,9 +1,9 @@
 """A whole session without people: a simulated participant drives real server, real pages and a simulated device.
 
-The server is a process of its own, as `hilbo session` starts it; the device is the firmware's core on a
+The server is a separate process, as `hilbo session` starts it; the device is the firmware's core on a
 pseudo-terminal, whose finger presses while a rendering is presented. In a study with [stimulus], a stand-in confirms
 what it is ordered (`stand_in`). The participant's page is in Chromium. The participant is drawn from the study's
-simulated population (`simulation.presets`) and answers from what was really on the device, or was confirmed.
+simulated population (`simulation.presets`) and responds to the values on the device, or to the confirmed ones.
 """
 
 import contextlib
@@ -161,7 +161,7 @@ def rehearse(
     by default the study's. Raises `InputError` for a study that is refused, before `out` is made, and `RuntimeError` if
     the server does not start.
     """
-    Study.load(source)  # what is refused leaves no folder behind
+    Study.load(source)  # a refusal leaves no folder behind
     out.mkdir(parents=True, exist_ok=True)
     file = fast_study(source, out / "study.toml", seconds, warm_up)
     study = Study.load(file)

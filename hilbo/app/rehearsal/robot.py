@@ -2,7 +2,7 @@
 
 Playwright drives the Chromium of this computer, without a window, as a person would: it opens the link, presses Begin,
 feels (the simulated device's finger presses while a rendering is presented), reads the question, and presses a key.
-What is presented it learns from the experimenter's JSON, which no participant has.
+It reads the stimulus from the experimenter's JSON, which no participant has.
 """
 
 import contextlib
@@ -179,7 +179,7 @@ _GO_ON = "() => { draw = window.drawing; draw(); }"
 
 @contextlib.contextmanager
 def held(window: Any) -> Iterator[None]:
-    """Within the block the page is not redrawn, whatever the server sends, so that what is read from it and its
+    """Within the block the page is not redrawn for messages of the server, so that its text and its
     screenshots agree."""
     window.evaluate(_HOLD)
     try:

@@ -1,4 +1,4 @@
-"""A stand-in for the program or the person that presents a study's renderings: it confirms whatever it is ordered.
+"""A stand-in for the program or the person that presents a study's renderings: it confirms every order.
 
 `hilbo simulate --live` uses it for a study with [stimulus], by the messages of any such program
 (docs/guides/stimulus.md).
@@ -19,11 +19,11 @@ __all__ = ["StandIn"]
 
 _SAID = {"name": "stand-in", "version": "1", "force": False, "neutral_within_s": 1.0}
 _WAIT = 0.2  # s that the server may keep a question without news
-_AGAIN = 0.1  # s until a server that did not take a report is asked again
+_AGAIN = 0.1  # s until a report that was not accepted is sent again
 
 
 class StandIn:
-    """Joins by the link of `role`, and confirms orders in a thread of its own until `close`, which the end of a with
+    """Joins by the link of `role`, and confirms orders in a separate thread until `close`, which the end of a with
     block calls."""
 
     def __init__(self, study: StudyFile, link: str, role: Role):
@@ -34,7 +34,7 @@ class StandIn:
         self._thread.start()
 
     def presented(self, trial: int) -> dict[str, Mapping[str, float]]:
-        """What was confirmed in a trial so far: side -> values as numbers (a level as its index in the study's list);
+        """Confirmed values of a trial so far: side -> values as numbers (a level as its index in the study's list);
         empty for an unknown trial."""
         return self._presented.get(trial, {})
 
@@ -53,7 +53,7 @@ class StandIn:
         """The thread: say hello, then report on each order as soon as it comes; after an error of the connection, begin
         again."""
         while not self._ended.is_set():
-            with contextlib.suppress(OSError, http.client.HTTPException):  # not taken, or nobody is there
+            with contextlib.suppress(OSError, http.client.HTTPException):  # not accepted, or no server
                 order = self._client.post(f"{self._path}/hello", _SAID)
                 run = order["run"]
                 while not self._ended.is_set():

@@ -2,7 +2,7 @@
 
 Nothing here knows of trials or answers. A job gives a `Future`; a fault of the device or the line is the `DeviceError`
 of the job, and sets `lost` of the snapshot; so does a device that has restarted, or receives no heartbeats. A lost
-device is tried again once a second; it comes back stopped. Sets are put in force, and START is sent, out of contact
+device is tried again once a second; it comes back stopped. Sets are activated, and START is sent, out of contact
 only: both are tried again until the hand has left. START and CLEAR carry the count of stops that was known when they
 were requested, so that neither acts after a stop that came meanwhile.
 """
@@ -52,7 +52,7 @@ class DeviceRig:
         self._ending = threading.Event()
         self._own_stops: list[int] = []  # the device's count of stops at each acknowledged STOP of this rig
         self.device = connect()
-        self._counter = SampleCounter(lambda: self.device.samples(0).flags)  # what has arrived, without waiting
+        self._counter = SampleCounter(lambda: self.device.samples(0).flags)  # data that have arrived, without waiting
         self.simulated = bool(self.device.can & Capability.SIMULATED)
         self.notes = list(self.device.notes)
         self.snapshot = self._look()
@@ -74,7 +74,7 @@ class DeviceRig:
         return f"{self.device.link.name}, damping {self.device.device.damping_N_s_per_m:.3g} N·s/m"
 
     async def prepare(self, showing: Showing) -> Loaded:
-        """Wait until the handle is out of contact, put the set of a rendering in force, and return it. Raises
+        """Wait until the handle is out of contact, put the set of a rendering active, and return it. Raises
         `DeviceError`."""
         wanted = self._wanted(showing)
         while (loaded := await asyncio.wrap_future(self.do(lambda device: self._load(device, wanted)))) is None:
@@ -82,7 +82,7 @@ class DeviceRig:
         return loaded
 
     async def show(self, showing: Showing) -> None:
-        """Start to render the set in force once the handle is out of contact; nothing if it is rendered already, nor
+        """Start to render the active set once the handle is out of contact; nothing if it is rendered already, nor
         for a step without a rendering (reference, neutral). Step 0 starts the count of the presentation's samples.
         Raises `DeviceError`."""
         if showing.step == 0:
@@ -99,7 +99,7 @@ class DeviceRig:
         return self._counter.counts((trial, presentation))
 
     async def blank(self) -> None:
-        """Do nothing: the set in force stays, and returns the handle when the hand leaves it."""
+        """Do nothing: the active set stays, and returns the handle when the hand leaves it."""
 
     async def rest(self) -> None:
         """Stop the device, and wait for that; the order is sent even if the caller is cancelled. Raises
@@ -109,7 +109,7 @@ class DeviceRig:
         await asyncio.shield(stopped)
 
     async def estop(self) -> None:
-        """Force to zero at once, before all queued jobs, in a thread of its own. Raises `DeviceError`."""
+        """Force to zero at once, before all queued jobs, in a separate thread. Raises `DeviceError`."""
         await asyncio.get_running_loop().run_in_executor(None, self.device.estop)
 
     async def clear(self) -> None:
@@ -176,7 +176,7 @@ class DeviceRig:
             return True
         if self.snapshot.state == "STOPPED" and self.snapshot.contact:
             return False
-        self._counter.drain()  # START drops what has not been taken
+        self._counter.drain()  # START drops samples that have not been taken
         try:
             device.start(stop=stop, wait=0.0)
         except DeviceError as error:
@@ -187,7 +187,7 @@ class DeviceRig:
         return True
 
     def _load(self, device: Renderer, wanted: ParameterSet) -> Loaded | None:
-        """Send a set, and return the one in force afterwards with the time it took; None, and nothing sent, while
+        """Send a set, and return the active one afterwards with the time it took; None, and nothing sent, while
         something touches the handle."""
         self._see(self._look())
         if self.snapshot.contact:

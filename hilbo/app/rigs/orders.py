@@ -1,7 +1,7 @@
 """Orders to the program or preparer that presents a study's renderings, and their messages; docs/guides/stimulus.md has
 every key.
 
-An order states what is to be presented from now on, not a change, so that a lost message does no harm.
+An order states the next presentation from now on, not a change, so that a lost message does no harm.
 """
 
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ class Order(NamedTuple):
 def as_sent(order: Order, study: StudyFile, tag: str) -> dict[str, Any]:
     """The message of an order, as a dict for JSON; only the number and `do` where nothing is presented. `tag`: makes
     the labels of renderings those of this session."""
-    assert study.stimulus is not None  # nobody else is given orders
+    assert study.stimulus is not None  # orders are for this program only
     showing = order.showing
     message: dict[str, Any] = {"order": order.number, "do": order.do}
     if showing is None:

@@ -1,5 +1,5 @@
-"""What presents renderings to a participant, whatever it is: a haptic device (`device_rig`), or a program or person
-with a link (`stimulus_rig`).
+"""Interface of the backends that present stimuli to a participant: a haptic device (`device_rig`), or a program or
+person with a link (`stimulus_rig`).
 
 A rig knows nothing of answers. It prepares a rendering, shows it, rests, stops; its state is a `Snapshot`, and it
 reports each new one. The runner leads a trial through any of them in the same way.
@@ -51,19 +51,19 @@ class Showing(NamedTuple):
 
 
 class Loaded(NamedTuple):
-    """A rendering in force: its facts for the log, and how long (s) the rig took, without the wait for a hand."""
+    """An active stimulus: its facts for the log, and how long (s) the rig took, without the wait for a hand."""
 
     facts: dict[str, Any]
     took_s: float
 
 
 class MissedError(RuntimeError):
-    """What was requested was not presented: the trial is void."""
+    """The requested stimulus was not presented: the trial is void."""
 
 
 @runtime_checkable
 class Rig(Protocol):
-    """What presents renderings. `notes`: what to tell the person who started it. `simulated`: nothing moves. Every
+    """Backend that presents stimuli. `notes`: messages for the person who started it. `simulated`: nothing moves. Every
     failure is a RuntimeError with a sentence."""
 
     title: str
@@ -77,12 +77,12 @@ class Rig(Protocol):
         ...
 
     async def prepare(self, showing: Showing) -> Loaded | None:
-        """Prepare a rendering while something else is presented. `Loaded` if it is then in force; None if it comes in
+        """Prepare a rendering while something else is presented. `Loaded` if it is then active; None if it comes in
         force with `show`. A rig that touches the hand waits here, and in `show`, until the hand has left."""
         ...
 
     async def show(self, showing: Showing) -> Loaded | None:
-        """Present a step from now on; returns once it is presented, with `Loaded` if that put a rendering in force.
+        """Present a step from now on; returns once it is presented, with `Loaded` if that activated a stimulus.
         Raises `MissedError`."""
         ...
 

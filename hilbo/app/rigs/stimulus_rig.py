@@ -1,6 +1,6 @@
-"""A rig that is a program with a link of its own, or a person with the preparer's page: orders to it, and its reports.
+"""A rig that is a program with its own link, or a person with the preparer's page: orders to it, and its reports.
 
-    program --> hello, then reports --> this rig --> orders, one at a time, each with a number of its own
+    program --> hello, then reports --> this rig --> orders, one at a time, each with its own number
 
 The response to each message is the newest order (`orders`). The program reports which order it knows and what it has
 done about it; it reports again and again, which is its sign of life. All of it happens in the event loop.
@@ -33,7 +33,7 @@ _HEARD = (
 )
 _WAIT = 5.0  # s that a program which joins may be kept waiting: clients wait for 10
 _TURN = 0.1  # s in which the timer of a silence has its turn
-_PART = 3  # a question is held for so small a part of the silence that is borne
+_PART = 3  # a request waits for at most this fraction of the silence limit
 
 
 class OverError(InputError):
@@ -58,7 +58,7 @@ class StimulusRig:
         changed: Callable[[Snapshot], Any] = lambda _: None,
         notice: Callable[[str], Any] = lambda _: None,
     ):
-        assert study.stimulus is not None  # nobody else presents
+        assert study.stimulus is not None  # no other program presents
         self._study, self._table, self._tag, self._changed = study, study.stimulus, tag, changed
         self.role = study.stimulus.role
         self.title = self.role.capitalize()
@@ -74,7 +74,7 @@ class StimulusRig:
         self._since = 0.0  # when the present order was given, monotonic
         self._stop_s: float | None = None  # s that the stop took when it was measured
         self._timers: dict[str, asyncio.TimerHandle] = {}
-        self._refused = ""  # what was not taken last, until something is
+        self._refused = ""  # last rejected report, until one is accepted
         self._ended = False
 
     @property
@@ -88,7 +88,7 @@ class StimulusRig:
         stop = "" if self._stop_s is None else f", stopped within {1000 * self._stop_s:.0f} ms"
         return f"{said.name} {said.version}, {'force' if said.force else 'no force'}{stop}"
 
-    # What the program says.
+    # Messages of the program.
 
     async def hello(self, hello: Hello, key: str = "") -> dict[str, Any]:
         """Accept a program that joins with a `key`, in place of any other, and return the new run, the limits, the

@@ -1,7 +1,7 @@
 """Admission of connections: the experimenter's at once, all others by round robin.
 
 An accepted connection is first only inspected: its data are read without being consumed. That costs a tenth of serving
-it, so that a thousand strangers who reconnect again and again do not hold up others. Connections that have sent nothing
+it, so that a thousand strangers who reconnect again and again do not delay others. Connections that have sent nothing
 are pending; the oldest of too many, and each after `PATIENCE`, is closed.
 """
 
@@ -54,7 +54,7 @@ class Listener:
         for _ in range(_AT_ONCE):
             try:
                 line, _ = self._listening.accept()
-            except BlockingIOError:  # nobody else
+            except BlockingIOError:  # no others
                 break
             except OSError:  # one that has left, or no file for it
                 self._make_room(0)

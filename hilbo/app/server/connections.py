@@ -1,6 +1,6 @@
 """Connections to the server and their limits, so that holders of a key are always served.
 
-A connection is a stranger's until a role's key has come in on it. Strangers and each role have limits of their own for
+A connection is a stranger's until a role's key has come in on it. Strangers and each role have separate limits for
 the number of connections; the oldest of too many is closed. The experimenter is served at once; stimulus programs,
 preparers, participants and strangers by round robin, request by request. A stranger's connection ends with its first
 response. A request has `PATIENCE` s and `LARGEST` bytes, header and body, and so has all of a stranger's connection.

@@ -21,8 +21,8 @@ from hilbo.errors import InputError
 __all__ = ["PORT", "Place", "bound", "qr_image", "qr_text", "serve"]
 
 PORT = 8642
-_LINGER = 3  # s for what is still being answered when the server ends
-_FILES = 512 if sys.platform == "win32" else 1024  # open files that are asked for: select() knows no more
+_LINGER = 3  # s for pending responses when the server ends
+_FILES = 512 if sys.platform == "win32" else 1024  # requested limit of open files: select() supports no more
 _SWITCH = 0.0005  # s until the busy event loop lets another thread go on: a stop passes through three of them
 _RESERVED = 160  # of them for connections that are served, the device, the log
 

@@ -13,7 +13,7 @@
     GET  /try, /api/try, /api/try/map   the page of `hilbo try` (`tried`), what it presents, and its end
 
 Errors are {"error": sentence}: 400 not understood, 401 no key, 403 from elsewhere, 404 none there, 409 not now, 413 too
-large, 503 not written. The event loop only waits here: files, device and arithmetic have threads of their own.
+large, 503 not written. The event loop only waits here: files, device and arithmetic have separate threads.
 """
 
 import asyncio
@@ -81,12 +81,12 @@ class _Guard:
                 message["headers"] = [*message["headers"], *_HEADERS.items()]
             await send(message)
 
-        with contextlib.suppress(ClientDisconnect):  # in mid-body: there is nobody to answer
+        with contextlib.suppress(ClientDisconnect):  # in mid-body: no client to answer
             await (_error(403, why) if why else self.app)(scope, receive, sending)
 
 
 def application(hub: Served, gate: Gate, tried: Tried | None = None) -> Starlette:
-    """The ASGI application of one session, or of what stands in a hub's place. `tried`: makes the data of the page of
+    """The ASGI application of one session, or of a replacement of its hub. `tried`: makes the data of the page of
     `hilbo try`, whose routes exist only with it."""
     guarded = _for(hub, gate)
     routes = [
@@ -151,7 +151,7 @@ def _is_form(request: Request) -> bool:
 
 
 async def _message(kind: type, request: Request) -> Any:
-    """The request's message, of the class `kind`. A JSON object is read as JSON whatever its header says: many clients
+    """The request's message, of the class `kind`. A JSON object is read as JSON for any header: many clients
     declare every body a form. Whether it is a form is kept in `request.state.form`. Raises `InputError`."""
     body = await _body(request)
     request.state.form = _is_form(request) and not body.lstrip().startswith(b"{")
@@ -199,7 +199,7 @@ def _for(hub: Served, gate: Gate) -> Callable[[Role, Callable], Handler]:
     def guarded(role: Role, handler: Callable) -> Handler:
         async def handle(request: Request) -> Response:
             if not gate.admits(role, _bearer(request)):
-                await _body(request)  # the connection ends with the answer, and with it what is still on its way
+                await _body(request)  # the connection ends with the response; data still under way are dropped
                 return _error(401, "Open the link of this session first; this page is no longer part of it.")
             if role == "participant" and _page_of(request) is None:
                 hub.watchers.heard()

@@ -22,7 +22,7 @@ _MOST = 64  # fields of a form
 
 def fields_of(body: bytes) -> dict[str, Any]:
     """The fields of a form as name -> text; those named "value.NAME" are together in `values`, NAME -> text. Raises
-    `InputError` for what is no form, has a field twice, or too many."""
+    `InputError` for text that is not a form, has a field twice, or too many."""
     try:
         pairs = parse_qsl(
             body.decode(), keep_blank_values=True, strict_parsing=bool(body), errors="strict", max_num_fields=_MOST

@@ -80,8 +80,8 @@ class Hello(_Message, frozen=True):
 class Report(_Message, frozen=True):
     """The state of a program that presents: which order it knows, and what it has done about it.
 
-    `values`: what is really in force, numbers and names of levels, if the state is "presented" and the order had any.
-    `wait_s`: how long it would wait for another order.
+    `values`: the values really presented, numbers and names of levels, if the state is "presented" and the order had
+    any. `wait_s`: how long it would wait for another order.
     """
 
     run: _Id
@@ -96,7 +96,7 @@ class Report(_Message, frozen=True):
 
 def read(kind: type, body: bytes, form: bool = False) -> Any:
     """The message of the class `kind` in a request's body, JSON or a form (`lines`); an empty body is an empty message.
-    Raises `TooLargeError`, and `InputError` with what is wrong."""
+    Raises `TooLargeError`, and `InputError` with the error."""
     if len(body) > LARGEST:
         raise TooLargeError(f"The message has more than {LARGEST} bytes, which are the most.")
     fields = fields_of(body) if form else {}

@@ -8,7 +8,7 @@ own browser finds its page by it, and a program that presents, once it is gone, 
 (`Gate.let_in`).
 
 Host and Origin of every request are compared with the addresses that the server was started for: a page of another site
-that reaches this computer by a name of its own (DNS rebinding) or by a form is refused, whatever key it has.
+that reaches this computer by its own name (DNS rebinding) or by a form is refused, whatever key it has.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ PAGES: tuple[Role, ...] = ("preparer", "participant", "experimenter")
 _BYTES = 24
 _LENGTH = 32  # characters of a key: base64 of _BYTES
 _DIGEST = re.compile("[0-9a-f]{64}")
-_KEYS = 4  # that a request may show, so that nobody has the server try thousands
+_KEYS = 4  # keys per request, so that a request cannot test thousands
 _SHOWN = re.compile(rf"earer {{1,8}}([\w-]{{{_LENGTH}}})(?![\w-])".encode())
 
 

@@ -199,7 +199,7 @@ def decode(
     capture: Annotated[Path, typer.Argument(help="Bytes of a line, as --capture writes them.", show_default=False)],
     as_json: JsonToo = False,
 ) -> None:
-    """Print every frame of a file of captured bytes, and what is wrong with damaged ones."""
+    """Print every frame of a file of captured bytes, and the errors of damaged ones."""
     from dataclasses import asdict
 
     from hilbo.device.frames import WireError
@@ -256,7 +256,7 @@ def simulate(line: Line) -> None:
 
 
 def _begin(device: Any, wanted: dict[str, Any] | None) -> None:
-    """Put a set in force, if one is given, and start to render; a handle in the material has `_LEAVES` s to leave.
+    """Activate a set, if one is given, and start to render; a handle in the material has `_LEAVES` s to leave.
     Prints both on stderr. Raises `DeviceError`."""
     if wanted is not None:
         print(f"in force: {set_words(device.send(**wanted))}", file=sys.stderr)

@@ -25,7 +25,7 @@ def condition_words(condition) -> str:
 
 
 def set_words(current) -> str:
-    """A set in force (`InForce`) in a line, with units."""
+    """An active set (`InForce`) in a line, with units."""
     length = f"N = {current.length}" if current.memory == "short" else f"full memory, {current.length} exponentials"
     return (
         f"K0 = {current.K0:.6g}, K1 = {current.K1:.6g} N/mm, B1 = {current.B1:.6g} N.s^alpha/mm,"
@@ -34,7 +34,7 @@ def set_words(current) -> str:
 
 
 def decoded(row: dict[str, Any]) -> str:
-    """A frame of a capture as a line: its first byte, its number, its message or what is wrong. `row`: as `hilbo device
+    """A frame of a capture as a line: its first byte, its number, its message or the error. `row`: as `hilbo device
     decode` prints it with --json."""
     seq = "  -" if row["seq"] is None else f"{row['seq']:3}"
     if row["message"] is None:

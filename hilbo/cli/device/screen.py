@@ -54,12 +54,12 @@ def trace(values: Any, width: int) -> str:
 
 
 class _View:
-    """What is on the screen: the last status, and the last seconds of telemetry."""
+    """Content of the screen: the last status, and the last seconds of telemetry."""
 
     def __init__(self, device: Renderer, title: str):
         self.device, self.title = device, title
         self.words: list[str] = []
-        self.start_after: int | None = None  # the device's count of stops when the start that waits was asked for
+        self.start_after: int | None = None  # the device's count of stops when the pending start was requested
         keep = round(_SHOWN / device.tick_s / max(1, device.divisor))
         self.position: deque[float] = deque(maxlen=keep)
         self.force: deque[float] = deque(maxlen=keep)
@@ -136,14 +136,14 @@ def watch(
 
 
 def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float | None) -> dict[str, Any]:
-    """Show the device and obey keys: 1 to 9 put the sets in force, space starts and stops, e is the emergency stop, c
+    """Show the device and obey keys: 1 to 9 activate the sets, space starts and stops, e is the emergency stop, c
     clears, q ends. Returns the summary with the names of the sets felt and the messages. Ends also after `seconds` of
     the device's time. Raises `InputError` for no set, too many, or one that the device refuses, `DeviceError` if the
     line is lost."""
     if not sets or len(sets) > len(_KEYS):
         raise InputError(f"There are {len(sets)} sets; between 1 and {len(_KEYS)} can be felt, one on each key.")
     for values in sets.values():
-        ParameterSet(**values).messages(device.device)  # says now what is wrong, and loads what full memory needs
+        ParameterSet(**values).messages(device.device)  # reports errors now, and loads the modules of full memory
     names = list(sets)
     title = "  ".join(f"[{key}] {name}" for key, name in zip(_KEYS, names, strict=False))
     view = _View(device, f"{title}\nspace: start or stop   e: emergency stop   c: clear   q: end")
@@ -175,7 +175,7 @@ def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float
 def _press(
     device: Renderer, view: _View, key: str, names: list[str], sets: Mapping[str, Mapping[str, Any]], felt: list[str]
 ) -> None:
-    """Carry out a key; the name of a set that it puts in force is appended to `felt`. Space while stopped only requests
+    """Carry out a key; the name of a set that it activates is appended to `felt`. Space while stopped only requests
     the start, which `_start_when_free` carries out."""
     if key in _KEYS[: len(names)]:
         name = names[_KEYS.index(key)]

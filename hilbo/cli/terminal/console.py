@@ -174,7 +174,7 @@ def _check_free(out: Path, force: bool) -> None:
 
 
 class Say:
-    """Progress of a command: called with what is being done and, where that is counted, how many are done, and of how
+    """Progress of a command: called with the current step and, where that is counted, how many are done, and of how
     many. `printed`: the sentences of `tell`."""
 
     def __init__(self, console: Any, status: Any):
@@ -199,7 +199,7 @@ class Say:
 
 @contextlib.contextmanager
 def progress(quiet: bool = False) -> Iterator[Say]:
-    """Show on stderr what is being done, in one changing line on a terminal, else in a line for each step, or every ten
+    """Show on stderr the current step, in one changing line on a terminal, else in a line for each step, or every ten
     seconds within one; at the end, how long it took. `quiet`: print nothing, for the processes whose results are not
     written."""
     from rich.console import Console
@@ -223,7 +223,7 @@ class _Pace:
         if done is None:
             self.text = text
             return text, True
-        if text != self.text or done < self.done:  # the first report has the compilation in it, and tells no pace
+        if text != self.text or done < self.done:  # the first report includes the compilation, and gives no pace
             again = text == self.text
             self.text, self.first, self.last_shown = text, (done, now), self.last_shown if again else -math.inf
         self.done = done

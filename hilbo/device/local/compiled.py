@@ -30,7 +30,7 @@ def compiled(name: str, what: str, parts: Sequence[str], sources: Sequence[str] 
 
     `what` names it in error messages. `parts`: the folders of its headers and sources. `sources`: patterns of the C
     files, if not all of these folders. Raises `DeviceError` if it cannot be built, with what to install, or if another
-    user may change what is in the cache.
+    user may change the content of the cache.
     """
     root, compiler = _sources(what), _compiler(what)
     files = [path for folder in parts for path in sorted((root / folder).glob("*.[ch]"))]

@@ -2,7 +2,7 @@
 
     with HostRenderer(numbers) as renderer:
         renderer.set(K0=0.1, K1=0.6, B1=0.5, alpha=0.3)
-        while True:                                              # each period, in a thread of its own
+        while True:                                              # each period, in a separate thread
             force = renderer.tick(position, velocity, time.perf_counter())
 
 It is `libhilbo_renderer`, compiled once with the C compiler of this computer; firmware/port/library/hilbo_renderer.h
@@ -188,7 +188,7 @@ class HostRenderer:
         exponentials: Sequence[tuple[float, float]] = (),
         force_limit: float | None = None,
     ) -> None:
-        """Check a parameter set and stage it; it is put in force at the first tick that allows it (`state().set`).
+        """Check a parameter set and stage it; it becomes active at the first tick that allows it (`state().set`).
 
         Units: N/mm, N·s^α/mm, N. `exponentials`: (weight, loss) pairs of full memory, instead of N. `force_limit`: None
         for the device's. Raises `InputError` for a set that the library refuses.

@@ -31,7 +31,7 @@ class Simulator:
 
     def __init__(self, *, rate: str = "realtime", **options: Any):
         arguments = [str(built()), "--control", "--rate", rate, *_arguments(options)]
-        # A process group of its own: the host handles Ctrl-C, stops the device and ends it.
+        # A separate process group: the host handles Ctrl-C, stops the device and ends it.
         self._process = subprocess.Popen(
             arguments,
             stdin=subprocess.PIPE,

@@ -129,7 +129,7 @@ def commission(
 ) -> Commissioned:
     """Check the signs of a device, home it, and measure its delay, friction and damping, in this order.
 
-    The device moves by itself, and a soft set stays in force. `say` receives progress messages; `bounds` of the nudges,
+    The device moves by itself, and a soft set stays active. `say` receives progress messages; `bounds` of the nudges,
     None for the default; `seed` of the order of the sweeps and of the bootstrap. Raises `DeviceError` at the first
     fault, after an emergency stop for a wrong sign, and `InputError` without the person's confirmation.
     """
@@ -286,7 +286,7 @@ def _home(device: Renderer, person: Person, moved_mm: float) -> None:
 
 
 def _heaviest_set(device: Renderer) -> list[str]:
-    """Send a soft set with the longest memory, to maximise the computing time of a tick; it stays in force.
+    """Send a soft set with the longest memory, to maximise the computing time of a tick; it stays active.
 
     Returns a list: empty, or with a note if the device refuses the set.
     """

@@ -234,7 +234,7 @@ def _watchdog(device: Renderer) -> tuple[int, float]:
     device.drive("force", "hold", 0.0, duration=5.0)
     wait_until(device, lambda: device.state() == State.DRIVING, "begun to drive")
     with device.link.silence():
-        last = device.status().tick  # whatever heartbeat there was has arrived by now
+        last = device.status().tick  # earlier heartbeats have arrived by now
         wait_until(device, lambda: device.state() == State.HOLD, "let go without heartbeats")
     status = device.status()
     if status.hold_reason != HoldReason.WATCHDOG:

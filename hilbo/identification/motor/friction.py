@@ -87,7 +87,7 @@ def sweeps(
         raise InputError(f"The sweeps are too short: {half * tick:.3g} s, and the first {settle:.3g} s are the turn.")
     for count, start in enumerate(starts):
         half_period = position[start : start + half]
-        # The handle turns later than the triangle, and at_turn there for as long as friction holds it.
+        # The handle turns later than the triangle, and at_turn there until friction releases it.
         at_turn = np.flatnonzero(
             half_period == (half_period.max() if half_period[0] > half_period[-1] else half_period.min())
         )

@@ -33,7 +33,7 @@ def quadratic(
     from scipy.optimize import minimize
 
     spread = x[observed].std(axis=0)
-    z = (x - x[observed].mean(axis=0)) / np.where(spread > 0, spread, 1.0)  # a parameter that nobody varied is 0
+    z = (x - x[observed].mean(axis=0)) / np.where(spread > 0, spread, 1.0)  # a constant parameter is 0
     first, second = np.triu_indices(x.shape[1])
     features = np.concatenate([z, z[:, first] * z[:, second]], axis=1)
     count = features.shape[1]

@@ -65,7 +65,7 @@ class LeftOut:
     q: Int[np.ndarray, " n"]
     probabilities: Float[np.ndarray, "n C"]
     not_converged: int = 0
-    """Folds in which a fit did not hold its certificate."""
+    """Folds in which a fit did not converge."""
     log_given: Float[np.ndarray, " n"] | None = None
     """Log probability of each answer, finite where the probability is 0 in this precision; None: its logarithm."""
 

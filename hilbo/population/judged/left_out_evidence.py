@@ -71,7 +71,7 @@ def maximise_left_out(
 ) -> Maximum:
     """Hyperparameters, one set for all participants, that maximise the left-out evidence with weak priors.
 
-    **Arguments:** `gp`: starting values, the priors' centre, and the values of what is not learnt; `learn`: which of
+    **Arguments:** `gp`: starting values, the priors' centre, and the fixed values; `learn`: which of
     "theta", "noise" and "thresholds"; others as for `left_out_evidence`. Of more than 64 participants, 64 evenly spaced
     ones are left out.
 

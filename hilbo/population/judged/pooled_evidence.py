@@ -2,7 +2,7 @@
 
 The model is the hierarchical one without individual functions, at the cost of its low rank
 (`hilbo.population.shared.low_rank`). Laplace's method. The features stay fixed during a descent, and are chosen again
-where it ends at other length scales. The weak priors are those of `hilbo.hyperparameters.maximum_evidence`.
+if it ends at other length scales. The weak priors are those of `hilbo.hyperparameters.maximum_evidence`.
 """
 
 from functools import partial
@@ -35,7 +35,7 @@ _MOVED, _REACH = 0.35, 1.5  # of log theta: after which features are chosen agai
 def maximise_pooled(gp: OrdinalGP, trials: Trials, learn: tuple[str, ...]) -> Maximum:
     """Hyperparameters that maximise the evidence of one function for all participants, with weak priors.
 
-    **Arguments:** `gp`: starting values, the priors' centre, and the values of what is not learnt; `trials`: stacked
+    **Arguments:** `gp`: starting values, the priors' centre, and the fixed values; `trials`: stacked
     (M, n); `learn`: which of "theta", "noise" and "thresholds".
 
     Raises `InputError` without responses. A search that fails does not raise: read `converged`.

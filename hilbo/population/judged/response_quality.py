@@ -91,7 +91,7 @@ def measure_people(gp: OrdinalGP, trials: Trials, names: tuple[str, ...], *, nea
 
     `trials`: stacked (M, n), in the order of the responses; `near`: NRMSE up to which stimuli count as repeated.
     `surprise` is the mean of -log p of a response, in nats, predicted by the participant's own model from the earlier
-    ones. What is not known is NaN. Of more than 200 responses of a participant, 200 evenly spaced ones are used for
+    ones. Unknown values are NaN. Of more than 200 responses of a participant, 200 evenly spaced ones are used for
     lapse, drift and surprise.
     """
     model = OrdinalGP(_Levelled(gp.kernel), gp.likelihood)
@@ -217,10 +217,10 @@ def _drift(
 
 def excluded(table: pd.DataFrame, rule: str) -> dict[str, str]:
     """Apply an exclusion rule to a table of `measure_people`: excluded participant -> reason, a text with the first
-    condition that holds and the participant's value.
+    fulfilled condition and the participant's value.
 
     A rule is one or more conditions joined by "or"; each has a measure, <, <=, > or >=, and a number; an empty rule
-    excludes nobody. A measure that is NaN fulfils no condition. Raises `InputError` for another rule.
+    excludes no participant. A measure that is NaN fulfils no condition. Raises `InputError` for another rule.
     """
     conditions = [_condition(condition) for condition in rule.split(" or ")] if rule.strip() else []
     reasons = {}

@@ -17,7 +17,7 @@ __all__ = ["FINE", "Chosen", "diagonals", "with_factors_if_worth"]
 
 FINE = 1e-3
 """Step of finite differences for curvatures, in units of the coordinates."""
-_GRADED = 4  # categories, from which widths and the fixed point can be told from sensitivities
+_GRADED = 4  # least categories for identifying widths and the fixed point in addition to sensitivities
 
 
 class Chosen(NamedTuple):
@@ -105,7 +105,7 @@ def _with_features_of(other: Problem, chosen: Chosen) -> Search:
 
 def _with_sensitivities(alike: Search, problem: Problem, fixed_point: float) -> tuple[Search, Problem]:
     """Continue the search `alike` with individual sensitivities, whose spread is learnt too: twice, by Laplace factors
-    at its start and at its first end. The cost of the result has the factors of its own end.
+    at its start and at its first end. The cost of the result has the factors of its end.
     """
     answers, free = problem.answers, frozenset(alike.coordinates) - {"widths"} | {"sensitivities", "spread"}
     dtype = answers.x.dtype

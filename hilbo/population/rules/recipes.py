@@ -38,7 +38,7 @@ class Recipe(NamedTuple):
 
     name: str
     kernel: Literal["rbf", "matern32"]
-    """Of the function that people share, and of everybody's own part."""
+    """Of the function that people share, and of each participant's own part."""
     priors: dict[str, Prior]
     """By the names of `posterior.Coordinates`; that of theta less log d. With "spread" participants may differ in
     sensitivity."""

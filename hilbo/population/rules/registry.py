@@ -40,7 +40,7 @@ class Rule:
     joint: bool = False
     """Whether one model is fitted to all answers at once, where they are few enough;"""
     exact_only: bool = False
-    """and nothing stands in for it where they are too many."""
+    """and no method replaces it where they are too many."""
     recipe: Recipe | None = None
     """Of a rule that learns the hyperparameters; others take them from [gp]."""
     predicts: bool = False
@@ -166,7 +166,7 @@ RECIPES: Final = {rule.name: rule.recipe for rule in _ALL if rule.recipe is not 
 DEFAULT: Final = "bcm"
 """Of a study file that names none: the paper's."""
 RECOMMENDED: Final = "learnt-2"
-"""What is shown beside a study's own rule."""
+"""Method that is shown in addition to the study's."""
 WITHDRAWN: Final = {
     "rbcm": '"rbcm", which was withdrawn: it won no comparison; write "learnt-2" (recommended) or "bcm" (the paper\'s).'
 }

@@ -47,7 +47,7 @@ class Pivots(NamedTuple):
     points: Float[Array, "r d"]
     used: Bool[Array, " r"]
     carry: Bool[Array, " r"]
-    """Those that hold the weights of the answers that were given there: the used ones, and of `every_point` all."""
+    """Those with the weights of the responses that were given there: the used ones, and of `every_point` all."""
     left: Float[Array, ""]
     """Largest part of the prior variance of g, at an answered point, that they do not explain."""
 
@@ -104,7 +104,7 @@ _rows_of = program(_chosen)
 def pivots_for(
     kernel: Stationary, answers: Tallies, tolerance: float = TOLERANCE, fewest: int = 0, most: int = _RANKS[-1]
 ) -> Pivots:
-    """`pivots_of`, with a record of the smallest of a few sizes that holds the pivots and `fewest` rows; compiled
+    """`pivots_of`, with a record of the smallest of a few sizes that fits the pivots and `fewest` rows; compiled
     functions exist for each size.
 
     `most`: largest number of pivots, with which more than `tolerance` may be left. Not under `jit`.

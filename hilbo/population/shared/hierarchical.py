@@ -43,7 +43,7 @@ __all__ = [
 ]
 
 Evidence = Callable[[Float[Array, ""]], tuple[Any, Any]]
-"""Of a share: the log evidence there, and whether its fit held."""
+"""Of a share: the log evidence there, and whether its fit converged."""
 
 _NODES = 33  # of the log evidence's Chebyshev interpolation in p
 _ENOUGH, _USABLE = 1e-5, 0.02  # error of the log evidence between them: that ends the refinement, that is too large
@@ -92,7 +92,7 @@ class Share(eqx.Module):
     interpolation_error: Float[Array, ""]
     """Estimate, of the log evidence between the nodes: its last Chebyshev coefficients."""
     converged: Array
-    """Every fit held its certificate, and the interpolation its tolerance."""
+    """Every fit converged, and the interpolation reached its tolerance."""
 
     @property
     def against_one(self) -> Float[Array, ""]:

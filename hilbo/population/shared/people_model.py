@@ -34,7 +34,7 @@ class PeopleModel(eqx.Module):
     levels: tuple[int, ...] = eqx.field(static=True, default=())
     """For each coordinate its number of unordered levels, as kernels take it."""
     effect: Float[Array, ""] | None = None
-    """Prior variance of what each context adds to everybody's function; None without a random effect."""
+    """Prior variance of what each context adds to each participant's function; None without a random effect."""
     log_sensitivities: Float[Array, " M"] | None = None
     """Logarithm of each person's sensitivity (`scale_use`); None: all participants have the same one."""
     fixed_point: Float[Array, ""] | None = None

@@ -29,7 +29,7 @@ class ContextEffects(eqx.Module):
     """
 
     prior: Float[Array, ""]
-    """Variance of what a context adds that nobody was asked in."""
+    """Variance of the effect of an untested context."""
     mean: Float[Array, " c"]
     variance: Float[Array, " c"]
     kernel: Stationary
@@ -68,7 +68,7 @@ def shared_function(model: PeopleModel, answers: Tallies, start: Float[Array, "M
     prior = prior_of(model, answers, pivots)
     mode = mode_of(model, answers, prior, start)
     value, slope, system = evidence_at(model, answers, prior, mode.weights)
-    # One step more changes the evidence by what is left of the way, or more.
+    # One more step changes the evidence by the remaining distance, or more.
     further = mode.weights + newton_step(prior, system, slope - mode.weights)[0]
     error = jnp.abs(evidence_at(model, answers, prior, further).log_evidence - value)
 

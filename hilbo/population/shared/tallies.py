@@ -19,7 +19,7 @@ __all__ = ["CountTerms", "Expansion", "Tallies", "expand_counts", "fit_counts", 
 
 
 class Tallies(eqx.Module):
-    """Counts (M, n, C) of the responses of M participants in C categories, at points (M, n, d) of their own.
+    """Counts (M, n, C) of the responses of M participants in C categories, at individual points (M, n, d).
 
     Rows beyond a participant's points have counts 0. `context` (M, n): of each point, as an index; None without a
     random effect.

@@ -93,7 +93,7 @@ def _answers(cohort: Cohort) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, 
 
 
 def _look(study: Study, category: int) -> dict[str, Any]:
-    """Keyword arguments of `scatter` for a category: a shape of its own, the darker the higher the category; the
+    """Keyword arguments of `scatter` for a category: a distinct shape, the darker the higher the category; the
     goal is a circle.
     """
     top = category == study.goal.category

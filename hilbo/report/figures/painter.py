@@ -45,7 +45,7 @@ def write_figures(figures: Mapping[str, Any], folder: Path) -> dict[str, bytes]:
     in the order given.
 
     The second process, if it runs, takes figures from the front and this one from the back. If it fails, this process
-    writes what is missing.
+    writes missing items.
     """
     from hilbo.report.figures.files import write_figure
 

@@ -1,6 +1,6 @@
 """The style that all figures share: colours, widths, axes with units, marks of optima.
 
-Maps use cividis and lines the Okabe-Ito colours, which people with colour-blindness can tell apart; what differs
+Maps use cividis and lines the Okabe-Ito colours, which are distinguishable with colour-blindness; what differs
 does so by shape too. Widths are those of one and of two columns of a journal.
 """
 

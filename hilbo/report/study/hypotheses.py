@@ -4,11 +4,11 @@ Every item is a sentence with its numbers, and whether it supports the hypothesi
 The bounds are stated in the sentence; a tie with the bound is inconclusive, so that a verdict does not depend on the
 direction of a scale. A difference between participants is inconclusive if its 95 % interval contains 0,
 or if it is equal for all of them. Items are not
-counted, and none is a test of its own. Only a study that asks for it has this
+counted, and none is a test by itself. Only a study that asks for it has this
 section (`[report] hypotheses = true`): the hypotheses are the paper's.
 
     H1  individuals' parameters can be found by asking      H3  individuals need not have converged for that
-    H2  a population's map has an optimum that people share  H4  it holds for other materials
+    H2  a population's map has an optimum that people share  H4  it applies to other materials
 
 The page has the hypotheses in full.
 """

@@ -297,7 +297,7 @@ def _shown(table: pd.DataFrame, digits: int = 4) -> tuple[list[str], list[list[s
 
 def _tolerances(table):
     """Rows (texts) of the page's table of tolerance intervals: each end with its reason and its bootstrap interval, and
-    the share of resamples without an interval; dashes for what is missing.
+    the share of resamples without an interval; dashes for missing items.
     """
     rows = []
     for row in table.to_dict("records"):

@@ -6,7 +6,7 @@
 
 The first trials are a Latin hypercube inside the feasible set, the following maximise the acquisition function over a
 low-discrepancy candidate set and are polished (paper, algorithm 1). The next point depends only on the study, the
-answers so far and the seed: fits start cold, from the physical values that a table would hold, so that a replay (of a
+answers so far and the seed: fits start cold, from the physical values as in a table, so that a replay (of a
 log, of a table, on another day) gives the same points bit for bit.
 """
 

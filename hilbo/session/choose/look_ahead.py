@@ -30,7 +30,7 @@ from hilbo.study.file.plan_file import Planned
 
 __all__ = ["LiveChooser", "warm_start_sources"]
 
-_KEPT = 64  # posteriors, the newest: those of the present, of what may follow, and of what undo leads back to
+_KEPT = 64  # posteriors, the newest: of the present state, of its possible successors, and of the states before undo
 
 
 class LiveChooser:

@@ -46,7 +46,7 @@ class WarmStart(eqx.Module):
     mean: Float[Array, " m"]
     variance: Float[Array, " m"]
     source: str = eqx.field(static=True)
-    """Start of the SHA-256 of the map's file, or another name for it: what the log holds."""
+    """Start of the SHA-256 of the map's file, or another name for it, as in the log."""
 
 
 def warm_start(

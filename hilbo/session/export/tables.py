@@ -237,7 +237,7 @@ def read_log_trials(
 ) -> TrialTable:
     """The trial table of a folder of session logs, of one `material` if it is given. `study` has all materials.
 
-    `note` is called with sentences on what is left out. Raises InputError for logs that are damaged or of another
+    `note` is called with sentences on omitted sessions. Raises InputError for logs that are damaged or of another
     study, if there are no answers, and for rows that `trial_table` refuses.
     """
     chosen = study.material(material) if material and study.materials else study

@@ -53,7 +53,7 @@ class Chooser(Protocol):
         ...
 
 
-# What may be done: each gives the event that says so, or raises RefusedError.
+# Actions: each returns its event, or raises RefusedError.
 
 
 def propose(state: LiveSession, chooser: Chooser, at: float) -> Event:
@@ -81,7 +81,7 @@ def propose(state: LiveSession, chooser: Chooser, at: float) -> Event:
 
 
 def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event:
-    """Event: a rendering is in force. `facts`: what a device reports (CRC, values read back, times), or `values`, those
+    """Event: a stimulus is active. `facts`: what a device reports (CRC, values read back, times), or `values`, those
     that a stimulus program confirms. Raises RefusedError for a trial that is not pending or lacks the side, and for
     values beyond the tolerance."""
     pending = _pending_trial(state, trial)

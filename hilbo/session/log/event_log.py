@@ -68,7 +68,7 @@ class EventLog:
     @classmethod
     def create(cls, path: str | os.PathLike, study: StudyFile, header: Header) -> "EventLog":
         """Create the log of a new session, with its folder, write and sync the header line, and lock the file. The
-        header that is written holds the study file.
+        header that is written contains the study file.
 
         A file with nothing but an incomplete header line is overwritten. Raises InputError for a header that is not
         valid, and if there is a log already, it is locked, or it cannot be created; LogError if the header cannot be

@@ -79,7 +79,7 @@ def _theirs(path: Path, participant: str) -> Iterator[tuple[Path, Header]]:
     """Yield the path and the header of each other log of a participant in the folder of `path`; unreadable logs are
     left out."""
     for other in log_paths(path.parent):
-        with contextlib.suppress(InputError, OSError), open(other, "rb") as file:  # a damaged log is nobody's
+        with contextlib.suppress(InputError, OSError), open(other, "rb") as file:  # a damaged log has no owner
             header = read_lines(file.readline(), other).header
             if other != path and header.participant == participant:
                 yield other, header

@@ -23,7 +23,7 @@ def check_confirmed(study: StudyFile, asked: Mapping[str, float], values: Mappin
     names = study.space.names
     if values is None or set(values) - _derived(study) != set(names):
         raise RefusedError("bad-answer", f"a confirmation has a value for {', '.join(names)}, and for nothing else.")
-    assert study.stimulus is not None  # whoever asks has looked
+    assert study.stimulus is not None  # checked by the caller
     for name in _derived(study) & set(values):
         wanted = asked.get(name, math.nan)
         if not abs(values[name] - wanted) <= _EXACT * abs(wanted):

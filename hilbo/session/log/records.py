@@ -69,7 +69,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Need(msgspec.Struct, frozen=True):
-    """What is to be proposed next: trial `planned` of a block's plan, or a repetition of trial `repeats`; if both are
+    """The next proposal: trial `planned` of a block's plan, or a repetition of trial `repeats`; if both are
     None, a rendering that the chooser selects."""
 
     block: int
@@ -136,7 +136,7 @@ class Trial:
 
 
 class Pause(NamedTuple):
-    """A pause of `seconds`, at least `PAUSE`, without any presentation or answer, whatever the cause: a break, a rest,
+    """A pause of `seconds`, at least `PAUSE`, without any presentation or answer, for any cause: a break, a rest,
     or a server that did not run. Event `seq`, of trial `trial`, ended it."""
 
     seq: int

@@ -37,7 +37,7 @@ class LiveSession:
     header: Header
     seq: int = 0
     trials: tuple[Trial, ...] = ()
-    extra: Mapping[int, int] = field(default_factory=dict)  # block -> renderings asked for by "another one"
+    extra: Mapping[int, int] = field(default_factory=dict)  # block -> stimuli requested by "another one"
     passed: frozenset[int] = frozenset()  # blocks that were begun by hand
     wanted: tuple[int, ...] = ()  # answered trials to be felt once more
     paused: str | None = None
@@ -174,7 +174,7 @@ class LiveSession:
         return next((i for i in range(len(self.header.blocks)) if not self.full(i)), None)
 
     def gate(self, block: int) -> Literal["ready", "rest"] | None:
-        """Screen that is shown before a block until somebody continues: "ready" after a warm-up, "rest" before a block
+        """Screen that is shown before a block until it is continued: "ready" after a warm-up, "rest" before a block
         with a rest; None for the first block, and once it was passed."""
         if block == 0 or block in self.passed:
             return None
@@ -201,7 +201,7 @@ class LiveSession:
 
     @cached_property
     def need(self) -> Need | None:
-        """What is to be proposed now, wanted repetitions first; None while a trial is pending or nothing is to be
+        """The proposal that is due, wanted repetitions first; None while a trial is pending or nothing is to be
         asked."""
         if self.screen != "wait":
             return None
@@ -220,7 +220,7 @@ class LiveSession:
         return self.trials[id - 1]
 
     def steps_of(self, trial: Trial) -> list[tuple[str, float]]:
-        """Steps of a trial: (what is shown, duration in s); a and b are swapped if b is presented first."""
+        """Steps of a trial: (stimulus, duration in s); a and b are swapped if b is presented first."""
         steps = protocol_of(self.study, self.header.blocks[trial.block]).steps
         other = {"a": "b", "b": "a"} if trial.first == "b" else {}
         return [(other.get(step.show, step.show), step.seconds) for step in steps]

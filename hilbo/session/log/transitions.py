@@ -2,7 +2,7 @@
 
 `APPLY` has the function for each kind of event, called with state and event; an event's `data["id"]` is a trial.
 
-A trial in which the device holds, stops or is lost after it began is voided and asked again; so is one that a stimulus
+A trial with a hold, stop or loss of the device after its begin is voided and repeated; so is one that a stimulus
 program did not present as requested (`missed`), which counts as a stop. A repeated, voided, undone, interrupted or
 paused presentation starts again from its first step. Whatever changes the answers drops a pending proposal that was
 made from the old ones. A repetition that was stopped twice is not asked again.
@@ -34,7 +34,7 @@ def _proposed(state, event):
 
 
 def _sent(state, event):
-    """Record that a side's rendering is in force; with a stimulus program, also the values that it confirmed."""
+    """Record that a side's stimulus is active; with a stimulus program, also the values that it confirmed."""
     trial = state.trial(event.data["id"])
     side = event.data["side"]
     state = state.with_trial(trial.id, sent={**trial.sent, side: event.data})
@@ -51,7 +51,7 @@ def _stimulus(state, event):
     trial, show = state.trial(event.data["id"]), event.data["show"]
     if not event.data["on"]:
         return state.with_trial(trial.id, on=None)
-    before = trial.felt if event.data["step"] > 0 else frozenset()  # the first step begins everything anew
+    before = trial.felt if event.data["step"] > 0 else frozenset()  # the first step resets the presentation
     felt = before | ({show} & set(trial.renderings))
     return state.with_trial(trial.id, step=event.data["step"], on=show, felt=felt)
 

@@ -1,4 +1,5 @@
-"""Plans of a study's sessions: what is shown to whom, in which order, from one seed; to be registered before it begins.
+"""Plans of a study's sessions: stimuli and order for each participant, from one seed; to be registered before it
+begins.
 
 `make_plan` gives the plan of a whole study, whose hash is in every log, `planned_header` the header of one session.
 Materials come in the orders of a Williams design, pairs balanced as `hilbo.session.plan.counterbalance` describes. With

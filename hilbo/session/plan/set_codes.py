@@ -1,8 +1,8 @@
 """Codes in place of participants' ids in the names of individual sets, and labels of renderings.
 
 Other participants compare these sets, and their answers contain the names. A code is made from the sets' values only,
-so that it leads to nobody once the results are deleted in which values and id are together. Labels are for people who
-refer to renderings without knowing their parameters.
+so that it identifies no participant once the results are deleted in which values and id are together. Labels are for
+people who refer to renderings without knowing their parameters.
 """
 
 import json
@@ -29,7 +29,7 @@ def code_of(values: Any, taken: Iterable[str] = ()) -> str:
 
 
 def label_of(values: Mapping[str, Any], session: str) -> str:
-    """Label of a rendering (parameter -> value): three letters and two digits from a hash, which tell nothing of the
+    """Label of a rendering (parameter -> value): three letters and two digits from a hash, which are independent of the
     values.
 
     Equal renderings have equal labels within a `session`, and other labels in another one.

@@ -38,8 +38,10 @@ __all__ = [
 ]
 
 CODED_JUDGED = re.compile(OWN + r"s[0-9a-f]{8}")
-"""In the name of a set of somebody's own map under a code, as others compare it."""
-_CODED_OWN = re.compile(rf"(?:.+ )?s[0-9a-f]{{8}}(?:-\d+)? (?:{'|'.join(ROLES)})")  # as nobody else compares it
+"""In the name of a set of an individual map under a code, as others compare it."""
+_CODED_OWN = re.compile(
+    rf"(?:.+ )?s[0-9a-f]{{8}}(?:-\d+)? (?:{'|'.join(ROLES)})"
+)  # as no other participant compares it
 _SET_COLUMNS = ("set_a", "set_b", "first", "preferred", "set_id", "source")
 _NAME_COLUMNS = ("set_a", "set_b", "set_id")
 _COUNT_PEOPLE = ("plan", "simulate", "power")  # commands whose --participants is a number
@@ -207,7 +209,7 @@ def command_without(command: str, participant: str) -> str:
     """Command without the participant in its options --names and --participants; "" if such an option names nobody
     else. Commands whose --participants is a number are changed in --names only."""
     words, kept = command.split(), []
-    with contextlib.suppress(ValueError):  # a list that somebody changed
+    with contextlib.suppress(ValueError):  # a list that was changed by hand
         words = shlex.split(command)
     names = {"--names"} if words[1:2] and words[1] in _COUNT_PEOPLE else {"--names", "--participants"}
     for before, word in zip(["", *words], words, strict=False):

@@ -64,7 +64,7 @@ def _names_participant(path: Path, participant: str) -> bool:
 def commands_of(folder: Path, participant: str, go: set[Path], files: Iterable[Path]) -> list[str]:
     """Shell commands that compute the results in `folder` again: `hilbo report` for each folder in them that keeps
     tables of its own, else the recorded command without the participant in --names and --participants; empty if those
-    name nobody else. A sentence in their place if no command is recorded.
+    name no other participant. A sentence in their place if no command is recorded.
 
     `go`: files that will be deleted, and so count as no tables; `files`: all files.
     """
@@ -92,7 +92,7 @@ def list_again(folder: Path, participant: str, changed: set[Path]) -> None:
         name: digest(folder / name) if (folder / name).resolve() in changed else was for name, was in files.items()
     }
     for place, _, _ in os.walk(folder, topdown=False):
-        with contextlib.suppress(OSError):  # it holds something
+        with contextlib.suppress(OSError):  # it is not empty
             os.rmdir(place)
     if files:
         write_list(folder, known._replace(files=files, command=command_without(known.command, participant)))

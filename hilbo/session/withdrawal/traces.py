@@ -50,7 +50,7 @@ class Below(NamedTuple):
     links: dict[Path, Path]
     """Those links -> the file itself."""
     left: dict[str, str]
-    """What was not looked into -> why."""
+    """Unsearched path -> reason."""
 
 
 def files_below(root: Path) -> Below:

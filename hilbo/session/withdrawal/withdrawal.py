@@ -1,4 +1,4 @@
-"""Withdrawal of a participant from a study: what is deleted, pseudonymised, to be computed again, and what is left.
+"""Withdrawal of a participant from a study: deletion, pseudonymisation, recomputation, and remaining files.
 
 `delete_participant` locks the folder throughout. Everything is decided before anything is changed, and written to a
 journal, which is deleted last: after an interruption the command is given again and ends as it would have, with the
@@ -50,11 +50,11 @@ class Withdrawal(msgspec.Struct):
 
     participant: str
     label: str = msgspec.field(default_factory=lambda: f"withdrawn-{secrets.token_hex(3)}")
-    """The pseudonym that stands in the place of the id where something of theirs stays."""
+    """The pseudonym that replaces the id in files that remain."""
     removed: dict[str, int] = {}
     """File -> rows that go, or 1 for the whole file."""
     renamed: dict[str, int] = {}
-    """File -> rows, or 1 for a plan, in which the pseudonym stands now."""
+    """File -> rows, or 1 for a plan, with the pseudonym."""
     commands: list[str] = []
     """What makes again the results that go."""
     left: dict[str, str] = {}
@@ -66,7 +66,7 @@ class Withdrawal(msgspec.Struct):
     sets: dict[str, str] = {}
     """Names of their sets -> what they are called now,"""
     sets_gone: list[str] = []
-    """and the sets that nobody else has compared."""
+    """and the sets that no other participant has compared."""
 
     @property
     def begun(self) -> bool:
@@ -75,11 +75,11 @@ class Withdrawal(msgspec.Struct):
 
 
 def delete_participant(folder: str | os.PathLike, participant: str, done: Withdrawal | None = None) -> Withdrawal:
-    """Remove one participant from everything below a folder, and return what was done and left.
+    """Remove one participant from everything below a folder, and return the actions taken and the remaining ones.
 
-    Deletes and rewrites files. Raises InputError if nothing of theirs is there, one of their sessions is running,
-    results are being computed, or a file could not be changed: all else is done then, and the command is to be given
-    again. `done` is filled on the way, so that the caller can report what was done even after an error.
+    Deletes and rewrites files. Raises InputError if there are no data of the participant, one of their sessions is
+    running, results are being computed, or a file could not be changed: all else is done then, and the command is to be
+    given again. `done` is filled on the way, so that the caller can report the actions taken even after an error.
     """
     root, done = Path(folder), Withdrawal(participant) if done is None else done
     if not participant.strip():
@@ -181,11 +181,11 @@ def _is_shared(path: Path) -> bool:
             return (path.suffix == ".csv" and b"consent_time" in file.readline(_HEAD)) or (
                 path.suffix == ".json" and plan_in(file.read()) is not None
             )
-    except OSError:  # which will be said
+    except OSError:  # which is reported
         return False
 
 
-# What is to be done.
+# The actions to take.
 
 
 def _planned(root: Path, before: Withdrawal) -> Withdrawal:
@@ -267,7 +267,7 @@ def _plan(path: Path, planned: Withdrawal) -> str | None:
     """Text of a plan's file without the participant; None if it is no plan, does not name them, or cannot be read."""
     try:
         return plan_without(path.read_bytes(), planned.participant, planned.label)
-    except OSError:  # which will be said
+    except OSError:  # which is reported
         return None
 
 

@@ -33,7 +33,7 @@ from hilbo.study.estimate.optimum import score
 __all__ = ["Sets", "best_mid_worst", "second_choice_sentence"]
 
 _STARTS = 24  # minima that are looked into,
-_SEPARATE = 0.1  # from starts so far apart
+_SEPARATE = 0.1  # least distance between starts
 _BEST_KNOWN = 0.1  # of the candidates, those with the smallest sd, where none is known
 
 

@@ -16,7 +16,7 @@ from hilbo.study.estimate.optimum import predict_map
 __all__ = ["SURE", "heterogeneity", "how_aggregated", "rule_warnings", "share_content"]
 
 SURE = 3.0  # log Bayes factor, about 20 to 1
-_TOO_SURE = 1.5  # times as large as the map says: a standard deviation worth a sentence
+_TOO_SURE = 1.5  # ratio of standard deviations above which it is reported
 
 
 def heterogeneity(aggregate: Any) -> dict[str, Any] | None:

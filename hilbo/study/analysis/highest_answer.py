@@ -35,7 +35,7 @@ def highest_answer(
 ) -> HighestAnswer | None:
     """Probability that a new participant's response is the study's goal at a point `x` (d,) of the unit cube.
 
-    The interval is of what is not known of the shared function there and, through `drawn`, of the hyperparameters; that
+    The interval covers the uncertainty of the shared function there and, through `drawn`, of the hyperparameters; that
     participants differ is part of the probability itself. None for methods that do not predict a new
     participant (`Rule.predicts`).
     """

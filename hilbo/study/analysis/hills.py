@@ -19,8 +19,8 @@ from hilbo.kernels import Stationary, embedded
 
 __all__ = ["Hill", "hills_of"]
 
-_AROUND, _MOST = 2, 64  # neighbours of a point: so many times 3^d, which stand all around it, up to a number
-_LEAST = 0.01  # of the draws: what is rarer is no hill to speak of
+_AROUND, _MOST = 2, 64  # neighbours of a point: so many times 3^d, in all directions, up to a number
+_LEAST = 0.01  # of the draws: rarer modes are ignored
 
 
 class Hill(NamedTuple):

@@ -4,7 +4,7 @@ A prefix of the trials is fitted like any cohort and searched from the same cand
 itself, which is not fitted again. Maps of prefixes are aggregated point by point: by the study's method, or by its
 pointwise counterpart if it takes all responses at once.
 
-The distance to the final optimum ends at 0 whatever the responses. So participants are also split into random halves:
+The distance to the final optimum ends at 0 for any responses. So participants are also split into random halves:
 what is the distance of the optimum of one half, after fewer trials, from that of the other half after all trials?
 """
 
@@ -34,7 +34,7 @@ __all__ = ["Progress", "follow"]
 
 _SPLITS = 50  # of the people into halves
 _FEWEST = 4  # people who can be split
-_POINTS = 1000  # at which the optimum of a half is sought
+_POINTS = 1000  # candidate points of the optimum of a half
 _LONGEST = 25  # points of a progress curve
 _AT_A_TIME = 2  # of which so many are computed: each search keeps a core busy, and no more
 _MOMENTS = (5, 15, 25)  # numbers of trials whose maps are drawn, as in the paper, and all trials

@@ -53,7 +53,7 @@ KNOWN = 0.8
 """Ratio of the map's standard deviation to that without responses, below which a point counts as covered by
 responses."""
 
-_POINTS = 400  # at which joint draws and bootstrap seek the optimum
+_POINTS = 400  # candidate points of joint draws and bootstrap
 _DRAWS = 2000
 
 
@@ -123,7 +123,7 @@ def _ground(study: Study, cohort: Cohort, posteriors: Posterior, pooled: RuleMap
 
 
 def _that_learns(study: Study, recipe: str, cohort: Cohort, everybody: bool) -> Study:
-    """The study with hyperparameters learnt from this cohort by `recipe`; what was learnt before is reused only if the
+    """The study with hyperparameters learnt from this cohort by `recipe`; earlier ones are reused only if the
     cohort is complete (`everybody`)."""
     learns = study if study.rule == recipe else that_learns(study, recipe)
     return resolved(learns if everybody else dataclasses.replace(learns, learnt=None), cohort)

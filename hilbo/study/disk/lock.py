@@ -18,7 +18,7 @@ __all__ = ["JOURNAL", "LOCK", "held", "lock", "locked_folder", "withdrawal_above
 
 LOCK = ".hilbo.lock"
 JOURNAL = ".hilbo-withdrawal.json"
-_PATIENCE = 10.0  # s; a table is written anew in far less
+_PATIENCE = 10.0  # s; a table is rewritten in far less
 _PAUSE = 0.01  # s
 
 
@@ -98,7 +98,7 @@ def locked_folder(folder: Path, patience: float = _PATIENCE, *, in_withdrawal: b
 
 
 def _is_interrupted(place: Path) -> bool:
-    """Whether the withdrawal that has its journal in this folder was killed: nobody holds the lock."""
+    """Whether the withdrawal that has its journal in this folder was killed: the lock is free."""
     try:
         file = held(place / LOCK)
     except OSError:

@@ -80,7 +80,7 @@ def _create_unfinished(out: Path, check: Callable[[], None]) -> tuple[Path, int]
         made = _beside(out, "part")
         made.mkdir(mode=0o700)
         filling = held(made / LOCK)
-        assert filling is not None  # whoever else would lock it needs the lock of the folder first
+        assert filling is not None  # other processes need the lock of the folder before they lock it
     return made, filling
 
 
@@ -98,7 +98,7 @@ def _is_filled(path: Path) -> bool:
 def _remove(folder: Path) -> None:
     """Delete a folder and its content, even while another process deletes it too."""
     while folder.exists():
-        with contextlib.suppress(FileNotFoundError):  # whoever filled it is removing it too
+        with contextlib.suppress(FileNotFoundError):  # the process that filled it is removing it too
             shutil.rmtree(folder)
 
 

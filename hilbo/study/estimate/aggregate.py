@@ -149,7 +149,7 @@ class Aggregate(eqx.Module):
 
     @property
     def surface(self) -> Surface:
-        """The population map as a function, which may be passed to compiled programs: it does not hold the
+        """The population map as a function, which may be passed to compiled programs: it does not contain the
         participants' ids."""
         return Surface(self.map)
 
@@ -247,7 +247,9 @@ def aggregate_cohort(
     optimum = map_optimum(study, map_, candidates)
     first(optimum, map_)
     beside = alternatives and not RULES[study.rule].learns
-    with _InOrder() if devices() > 1 else ThreadPoolExecutor(1) as other_core:  # for what does not wait for the share
+    with (
+        _InOrder() if devices() > 1 else ThreadPoolExecutor(1) as other_core
+    ):  # for computations that do not need the share
         own = other_core.submit(_own_optima, study, posteriors, candidates, say) if individuals else None
         by_other = other_core.submit(_by_other_inference, study, cohort, candidates, share) if beside else None
         if share is None and beside and np.sum(cohort.counts() > 0) > 1:

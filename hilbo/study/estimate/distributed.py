@@ -155,5 +155,5 @@ def digest(*parts: PyTree) -> str:
     for leaf in jax.tree.leaves(parts):
         is_array = isinstance(leaf, jax.Array | np.ndarray)
         hasher.update(np.ascontiguousarray(leaf).tobytes() if is_array else repr(leaf).encode())
-    hasher.update(repr(jax.tree.structure(parts)).encode())  # with what records hold besides arrays
+    hasher.update(repr(jax.tree.structure(parts)).encode())  # with the non-array fields of records
     return hasher.hexdigest()

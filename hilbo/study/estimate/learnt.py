@@ -21,7 +21,7 @@ from hilbo.study.config import Study
 __all__ = ["by_rule", "effect_content", "learnt_content", "learnt_sentences", "resolved", "that_learns"]
 
 _LABELS = {"effect": "random effect", "spread": "spread of sensitivities"}
-_UNKNOWN = 0.9  # of the prior's standard deviation: the answers hardly say more
+_UNKNOWN = 0.9  # of the prior's standard deviation: above it, not identified by the responses
 
 
 def that_learns(study: Study, recipe: str = RECOMMENDED) -> Study:

@@ -1,7 +1,7 @@
 """plan.json, the plan of a study's sessions: its record, reading with checks, and its text.
 
 A plan's hash is the first 16 hex digits of the SHA-256 of its other content, as JSON with sorted keys and no blanks.
-Session logs hold it, and a file whose hash does not match has been changed.
+Session logs contain it, and a file whose hash does not match has been changed.
 """
 
 import json
@@ -139,7 +139,7 @@ def read_plan(path: str | os.PathLike) -> Plan:
 
 def _hash_of(plan: Plan) -> str:
     """Hash of the plan's content without its field `hash`: first 16 hex digits of the SHA-256."""
-    typed = msgspec.convert(msgspec.to_builtins(plan), Plan)  # a whole number that stands for a float becomes one
+    typed = msgspec.convert(msgspec.to_builtins(plan), Plan)  # a whole number in place of a float becomes one
     content: dict[str, Any] = msgspec.to_builtins(typed)
     del content["hash"]
     return digest_of(json.dumps(content, sort_keys=True, ensure_ascii=False, separators=(",", ":")).encode())

@@ -45,7 +45,7 @@ class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Protocol(msgspec.Struct, frozen=True):
-    """A phase: the steps of each trial, what is asked after them, and how many trials there are.
+    """A phase: the steps of each trial, its questions, and the number of trials.
 
     `count`: the least number of renderings (warm-up), how often each pair is shown (validation) or each individual's
     best (aggregate-best); 0 where the study's [selection] says it (optimisation). `rest`: seconds between materials.

@@ -124,7 +124,7 @@ class StudyFile:
         return differing_keys(meaning_part(other.tables), meaning_part(self.tables))
 
     def stored(self, tables: Content) -> "StudyFile":
-        """The file of `tables`, as a log holds them, under this file's path. Raises `InputError`."""
+        """The file of `tables`, as in a log, under this file's path. Raises `InputError`."""
         return checked({"schema": 1} | tables, self.source, _identity)
 
     def material(self, name: str) -> "StudyFile":

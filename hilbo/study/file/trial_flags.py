@@ -1,8 +1,9 @@
 """Flags that the telemetry of a device may mark a trial with, and sentences about them. Loads no JAX and no pandas.
 
-In tables the column `flags` holds the flags of a trial, separated by spaces: "saturated slewed". Other words in it are
-ignored. `telemetry_samples` is the number of samples that were recorded with the trial; it is empty without telemetry,
-which distinguishes such a trial from one without flags. `hilbo.study.tables.flag_counts` reads these columns.
+In tables the column `flags` contains the flags of a trial, separated by spaces: "saturated slewed". Other words in it
+are ignored. `telemetry_samples` is the number of samples that were recorded with the trial; it is empty without
+telemetry, which distinguishes such a trial from one without flags. `hilbo.study.tables.flag_counts` reads these
+columns.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -52,7 +53,7 @@ def flag_words(flags: Iterable[str]) -> str:
 
 def flag_sentences(counts: FlagCounts, exclude: Collection[str], what: str = "trials") -> list[str]:
     """One sentence with the number of trials per flag and the number excluded; an empty list if no telemetry was
-    recorded and the study excludes no flag. `what`: plural of what is counted."""
+    recorded and the study excludes no flag. `what`: plural of the counted items."""
     rule = f"[study] exclude_flags ({', '.join(exclude)})"
     if not counts.recorded:
         return [f"No device flags were recorded for these {what}; {rule} excludes none."] if exclude else []

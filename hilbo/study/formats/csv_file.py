@@ -142,8 +142,8 @@ def numbers(
 
 
 def answer_forms(responses: Sequence[str]) -> tuple[dict[str, int], str]:
-    """Accepted texts of a response -> category from 0, and the description of what is accepted besides labels ("" for
-    only labels).
+    """Accepted texts of a response -> category from 0, and the description of the accepted texts other than labels (""
+    for only labels).
 
     If all labels are whole numbers, "6.0" and "6,0" also mean the label "6", since pandas writes a column with missing
     cells so. If some label reads as a number otherwise, only labels are accepted. If no label does, ranks from 1 are

@@ -36,7 +36,7 @@ def read_bytes(path: str | os.PathLike) -> bytes:
 
 
 def decoded(content: bytes, kind: Any, source: str, what: str) -> Any:
-    """Parse JSON as an object of the type `kind`. `source`: the file, `what`: what is wrong and what to do, both for
+    """Parse JSON as an object of the type `kind`. `source`: the file, `what`: the error and what to do, both for
     the message. Raises InputError if the bytes are not JSON, or not of this type."""
     try:
         return msgspec.json.decode(content, type=kind)
@@ -45,7 +45,7 @@ def decoded(content: bytes, kind: Any, source: str, what: str) -> Any:
 
 
 def converted(raw: Any, kind: Any, source: str, what: str) -> Any:
-    """Convert parsed Python data to an object of the type `kind`. `source`: the file, `what`: what is wrong and what to
+    """Convert parsed Python data to an object of the type `kind`. `source`: the file, `what`: the error and what to
     do, both for the message. Raises InputError if they are not of this type."""
     try:
         return msgspec.convert(raw, kind)

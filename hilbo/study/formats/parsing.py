@@ -1,4 +1,4 @@
-"""Parsers of text from users: every exception becomes one sentence, and the size of what is read is limited.
+"""Parsers of text from users: every exception becomes one sentence, and the size of the input is limited.
 
 A parser meets more than syntax errors: an integer with thousands of digits is a plain `ValueError`, and deeply nested
 lists end in a `RecursionError`, in the parser or in code that walks its result.

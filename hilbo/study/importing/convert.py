@@ -1,4 +1,4 @@
-"""Conversion of an export to a trial table by a mapping, and the record of what was done. Loads no JAX."""
+"""Conversion of an export to a trial table by a mapping, and the record of the actions taken. Loads no JAX."""
 
 import re
 from collections import Counter
@@ -37,9 +37,9 @@ class Imported(NamedTuple):
     ids: dict[str, str]
     """Id in the export -> id in the table; empty if ids are as written."""
     record: Content
-    """What was done, in counts; it holds no ids."""
+    """Actions taken, in counts, without ids."""
     sentences: list[str]
-    """What was done, for the user."""
+    """Actions taken, for the user."""
 
 
 def converted(

@@ -28,7 +28,7 @@ _LINES = {
     "trials_from": "number of the first trial in the table",
     "decimal": "decimal mark",
     "missing": "cells that mean a missing response",
-    "keep": "further columns to copy; look at what they hold about participants",
+    "keep": "further columns to copy; check them for personal data",
     "columns": "column of the trial table = column of the export",
     "rows": "only rows with one of these cells are trials",
     "responses": "cell of the export = response of the study",

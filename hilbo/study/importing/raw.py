@@ -160,7 +160,7 @@ def _json_rows(text: str, source: str) -> tuple[list[int], list[list[str]]]:
     records = [_flat(record) for record in _records(text, source)]
     names = list(dict.fromkeys(name for record in records for name in record))
     rows = [names, *([record.get(name, "") for name in names] for record in records)]
-    return list(range(len(rows))), rows  # record 1 is row 1; the header has no row of its own
+    return list(range(len(rows))), rows  # record 1 is row 1; the header is not counted
 
 
 def _records(text: str, source: str) -> list[Content]:
@@ -173,7 +173,7 @@ def _records(text: str, source: str) -> list[Content]:
     records = [record for record in flat if isinstance(record, dict)]
     if len(records) < len(flat):
         wrong = next(record for record in flat if not isinstance(record, dict))
-        raise InputError(f"{source}: holds {json.dumps(wrong)[:60]} where a record is expected; export it as records.")
+        raise InputError(f"{source}: has {json.dumps(wrong)[:60]} where a record is expected; export it as records.")
     return records
 
 

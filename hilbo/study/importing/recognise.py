@@ -29,7 +29,7 @@ _IMPORT_ID = '{"ImportId"'  # begins the cells of the third row of Qualtrics
 
 
 class Proposal(NamedTuple):
-    """A mapping, and what is missing in it."""
+    """A mapping, and missing items in it."""
 
     mapping: Mapping
     questions: list[str]
@@ -89,7 +89,7 @@ def _participant(seen: _Seen, files: int, questions: list[str]) -> str:
 
 def _trials(seen: _Seen, study: StudyFile, participant: str, questions: list[str]) -> dict[str, str]:
     """The columns of response, trial and parameters: of a table with a row for each trial, else of one with a row for
-    each participant. Adds questions for what is missing."""
+    each participant. Adds questions for missing items."""
     by_name = {p.name: _parameter(seen, p) for p in study.space.parameters}
     given = [column for columns in by_name.values() for column in columns]
     if given:  # other rows may have answers to other questions
@@ -127,7 +127,7 @@ def _which(what: str, hits: Sequence[str], columns: Sequence[str]) -> str:
     """Question for a column that is missing or not unique."""
     if hits:
         return f"{what} may be in {_some(hits)}: write in [columns] which."
-    return f"no column is known to hold the {what} ({_some(columns)}): write it in [columns]."
+    return f"no column is recognised as the {what} ({_some(columns)}): write it in [columns]."
 
 
 def _some(names: Sequence[str]) -> str:
@@ -136,7 +136,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _parameter(seen: _Seen, parameter: Parameter) -> list[str]:
-    """Columns that may hold a parameter, by their name."""
+    """Columns that may contain a parameter, by their name."""
     return named(seen.columns, (parameter.name,), parameter.unit)
 
 
@@ -147,8 +147,8 @@ def _are_whole(cells: pd.Series) -> bool:
 
 
 def _responses(seen: _Seen, study: StudyFile, taken: set[str]) -> list[str]:
-    """Columns that may hold the response: by name, those in which some cell is a response of the study; else by cells,
-    those that hold nothing but labels and missing marks."""
+    """Columns that may contain the response: by name, those in which some cell is a response of the study; else by
+    cells, those that contain only labels and missing marks."""
     free = [column for column in seen.columns if column not in taken]
     answered = [column for column in free if _has_answers(seen, column, study, whole=False)]
     if hits := named(answered, RESPONSE):

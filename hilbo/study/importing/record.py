@@ -1,4 +1,4 @@
-"""The record of an import: what was read, converted and left out. Loads no JAX."""
+"""The record of an import: rows read, converted and left out. Loads no JAX."""
 
 from collections import Counter
 from collections.abc import Mapping as MappingLike
@@ -37,7 +37,7 @@ def record_of(
     ids: MappingLike[str, str],
     counts: Counts,
 ) -> Content:
-    """What was done, without ids and names of files: counts, columns, conversions. `study`: hash of the study file,
+    """Actions taken, without ids and names of files: counts, columns, conversions. `study`: hash of the study file,
     `table`: the trial table, `ids`: id in the export -> id in the table."""
     columns = dict.fromkeys(name for raw in tables for name in raw.cells.columns)
     used = {*mapping.columns.values(), *mapping.keep, *mapping.rows}

@@ -88,7 +88,7 @@ def named(columns: Sequence[str], wanted: Iterable[str], unit: str = "") -> list
 
 
 def personal(columns: Iterable[str]) -> list[str]:
-    """The columns that by their name hold what identifies a person: address, name, place, id of a platform."""
+    """The columns that by their name identify a person: address, name, place, id of a platform."""
     return [column for column in columns if key(column) in _PERSONAL]
 
 

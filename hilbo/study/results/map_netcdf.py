@@ -63,7 +63,7 @@ def map_dataset(study: Study, surface: Callable[..., Any], cells: int = CELLS) -
             "feasible": (
                 names,
                 np.asarray(study.space.feasible(flat)).reshape(shape),
-                {"long_name": "may be rendered"},
+                {"long_name": "feasible"},
             ),
         },
         coords={p.name: (p.name, p.to_physical(side), {"units": p.unit}) for p in shown},

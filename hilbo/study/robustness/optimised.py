@@ -2,7 +2,8 @@
 
 - Committees, combined point by point: the evidence of each participant given all others
   (`hilbo.population.judged.left_out_evidence`).
-- One model of all responses ("pooled"): its evidence, by Laplace's method. A single participant: that of their own.
+- One model of all responses ("pooled"): its evidence, by Laplace's method. A single participant: the individual
+  evidence.
 - Methods that learn the hyperparameters: their own, the evidence of the hierarchical model; fixed are the medians of
   the recipe's priors.
 

@@ -37,7 +37,7 @@ from hilbo.study.robustness.optimised import LEARNABLE, FixedAndOptimised, diffe
 
 __all__ = ["LIMIT", "NEAR", "Place", "Resampled", "Robustness", "robustness"]
 
-_POINTS = 1000  # among which the optimum of resampled people is sought
+_POINTS = 1000  # candidate points of the optimum of resampled participants
 LIMIT = 0.03
 """NRMSE from which an optimum is flagged as not robust (paper, section IV-3)."""
 NEAR = 0.1

@@ -11,7 +11,7 @@ from hilbo.study.file.trial_flags import COLUMN, COLUMN_OF_SAMPLES, FLAGS, FlagC
 __all__ = ["added", "counted_flags", "flag_counts", "flag_sentences_of", "flagged", "with_flag_counts"]
 
 _COUNTS = "hilbo flags"
-"""Key of a DataFrame's attributes that holds its `FlagCounts`."""
+"""Key of the `FlagCounts` in a DataFrame's attributes."""
 _NONE_RECORDED = ("", "0", "0.0", "nan", "none", "<na>")
 
 
@@ -60,7 +60,7 @@ def added(parts: Iterable[FlagCounts]) -> FlagCounts:
 
 def flag_sentences_of(counts: FlagCounts, exclude: Collection[str], what: str = "trials") -> list[str]:
     """One sentence on the number of trials per flag and the number excluded; an empty list if no trial has a flag and
-    the study excludes none. `what`: plural of what is counted."""
+    the study excludes none. `what`: plural of the counted items."""
     return flag_sentences(counts, exclude, what) if counts.flagged or exclude else []
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 
 __all__ = ["Missing", "missing_labels"]
 
-_NAMED = 6  # participants whom a sentence names
+_NAMED = 6  # participants named in a sentence
 
 
 class Missing(NamedTuple):

@@ -9,7 +9,7 @@ from hilbo.study.formats.cell_text import alike, is_rounded
 
 __all__ = ["note_absent", "note_doubtful_ids", "note_forms"]
 
-_NAMED = 6  # people of whom a remark says the names
+_NAMED = 6  # participants named in a remark
 _FEW_FORMS = 3  # of ids; more are random texts
 
 

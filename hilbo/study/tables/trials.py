@@ -98,7 +98,7 @@ def trial_table(
     for text in cells:
         _check_columns(text, study, source)
         say(rows := rows + len(text))
-        if material is not None and "material" in text:  # each material has ranges of its own
+        if material is not None and "material" in text:  # each material has separate ranges
             named |= dict.fromkeys(text["material"])
             text = text[text["material"] == material]
         pieces.append(_checked(text, study, source, others, texts))
