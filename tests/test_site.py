@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from formulas import rendered
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.deep
@@ -50,3 +51,24 @@ def test_words_of_the_field_lead_to_a_heading(entries, word, page):
 def test_the_changelog_is_not_searched(entries):
     assert len(entries) > 500
     assert [entry["location"] for entry in entries if entry["location"].startswith("changelog")] == []
+
+
+def test_formulas_are_mathml_and_no_tex_is_left(site):
+    for page, least in (
+        ("mechanics", 40),
+        ("inference", 15),
+        ("statistics", 20),
+        ("aggregation", 6),
+        ("identification", 3),
+    ):
+        text = (site / "methods" / f"{page}.html").read_text(encoding="utf-8")
+        assert text.count("<math ") >= least and "$$" not in text and 'class="arithmatex"' not in text
+
+
+def test_a_formula_becomes_mathml_or_is_refused():
+    pytest.importorskip("latex2mathml")
+    page = r'<p><span class="arithmatex">\(a &lt; \frac{1}{b}\)</span></p><div class="arithmatex">\[\alpha\]</div>'
+    made = rendered(page)
+    assert made.count("<math ") == 2 and "<mfrac>" in made and 'display="block"' in made and "&lt;" in made
+    with pytest.raises(ValueError, match="does not know"):
+        rendered(r'<span class="arithmatex">\(\unheardof{x}\)</span>')

@@ -10,6 +10,8 @@ import posixpath
 import re
 from pathlib import Path
 
+from formulas import rendered
+
 ROOT = Path(__file__).parents[2]
 FENCE = "```"
 EXECUTED = ROOT / "build" / "notebooks"  # what `make notebooks` makes; where it was not made, pages show the code alone
@@ -147,6 +149,15 @@ def on_page_markdown(markdown, page, config, files):
         return f"{match['image']}[{match['text']}]({place})" if place else match["text"]
 
     return re.sub(r"(?P<image>!?)\[(?P<text>[^\]\n]+)\]\((?P<target>[^)\s]+)\)", link, markdown)
+
+
+def on_page_content(html, page, config, files):
+    from mkdocs.exceptions import PluginError
+
+    try:
+        return rendered(html)
+    except ValueError as error:
+        raise PluginError(f"{page.file.src_uri}: {error}") from error
 
 
 def on_post_build(config):
