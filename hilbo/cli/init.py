@@ -29,7 +29,9 @@ def init(
     ] = None,
     constraint: Annotated[
         list[str] | None,
-        typer.Option(help="Linear constraint in physical units, e.g. 'a + 2*b <= 3' or '0 <= a - b <= 1'. Repeatable."),
+        typer.Option(
+            help="Linear constraint in physical units, e.g. 'a + 2*b <= 3', '0 <= a - b <= 1', 'a + b = 1'. Repeatable."
+        ),
     ] = None,
     responses: Annotated[str, typer.Option(help="Response categories, lowest first.")] = "different,similar,close",
     goal: Annotated[str, typer.Option(help="The response to maximise; by default the highest.")] = "",

@@ -47,6 +47,7 @@ def climb(
     allowed: _Test | None = None,
     walls: Polytope | None = None,
     held: Bool[Array, " d"] | bool = False,
+    dependent: Bool[Array, " d"] | bool = False,
     neighbours: _Neighbours | None = None,
     steps: int = 50,
     gain: ArrayLike = 0.0,
@@ -65,8 +66,9 @@ def climb(
     - `feasible`: whether a point is feasible.
     - `allowed`: further condition on the end of a search, e.g. not too close to earlier points.
     - `walls`: linear constraints in the optimiser's coordinates; None if all of [0, 1]^d is feasible there. Only with
-      `walls` are these two used: `held`: mask of the discrete coordinates; `neighbours`: the points one discrete step
-      away, tried at the end of each search.
+      `walls` are these three used: `held`: mask of the coordinates that do not move, discrete or dependent;
+      `dependent`: mask of those of them that `from_box` computes from the others; `neighbours`: the points one discrete
+      step away, tried at the end of each search.
     - `steps`: largest number of Newton steps of a search.
     - `gain`: a search ends where the score could rise by less than this (see `TrustRegionNewton`).
     """
@@ -76,7 +78,9 @@ def climb(
 
     if walls is None:
         return _Straight(score, from_box, to_box, may_end, steps, gain).best(starts, usable)
-    within = _Within(score, from_box, to_box, may_end, walls, jnp.broadcast_to(held, starts.shape[1:]), neighbours)
+    held = jnp.broadcast_to(held, starts.shape[1:])
+    fixed = held if dependent is False else held & ~jnp.broadcast_to(dependent, starts.shape[1:])
+    within = _Within(score, from_box, to_box, may_end, walls, held, fixed, neighbours)
     return _best_of(*jax.lax.map(lambda of: within.climbed(of[0], of[1], steps, gain), (starts, usable)))
 
 
@@ -151,6 +155,8 @@ class _Within(NamedTuple):
     may_end: _Test
     walls: Polytope
     held: Bool[Array, " d"]
+    fixed: Bool[Array, " d"]
+    """The coordinates that are held, but for the dependent ones."""
     neighbours: _Neighbours | None
 
     def climbed(
@@ -188,7 +194,7 @@ class _Within(NamedTuple):
         """
         options = {"walls": self.walls, "held": self.held}
         w, height = _polish(lambda w: self.score(self.from_box(w)), self.to_box(x), steps, gain, options)
-        end = jnp.where(self.held, x, self.from_box(jnp.clip(w, 0.0, 1.0)))  # a step may end a rounding error outside
+        end = jnp.where(self.fixed, x, self.from_box(jnp.clip(w, 0.0, 1.0)))  # a step may end a rounding error outside
         better = (height > value) & self.may_end(end)
         return jnp.where(better, end, x), jnp.where(better, height, value)
 
@@ -208,7 +214,7 @@ class _Within(NamedTuple):
         left = self.walls.offsets.astype(w.dtype) - self.walls.normals.astype(w.dtype) @ w
         seen = cube._replace(offsets=cube.offsets.at[: left.size].set(left))
         moved = w + nearest(seen, jnp.zeros_like(w), jnp.eye(w.size, dtype=w.dtype)).point
-        return jnp.where(self.held, x, self.from_box(jnp.clip(moved, 0.0, 1.0)))
+        return jnp.where(self.fixed, x, self.from_box(jnp.clip(moved, 0.0, 1.0)))
 
 
 def _best_of(ends: Float[Array, "s d"], values: Float[Array, " s"], start_values: Float[Array, " s"]) -> Choice:

@@ -6,11 +6,13 @@ lower and load, and nothing to run. Small computations are therefore done by Num
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-__all__ = ["floating", "namespace_of", "on_host", "scan", "to_device"]
+__all__ = ["floating", "namespace_of", "on_host", "scan", "stopped", "to_device"]
+
+_T = TypeVar("_T")
 
 
 def namespace_of(*values: Any) -> Any:
@@ -40,6 +42,15 @@ def scan(step: Callable[[Any, Any], Any], start: Any, over: Any) -> Any:
     import jax
 
     return jax.lax.scan(lambda carry, value: (step(carry, value), None), start, over)[0]
+
+
+def stopped(value: _T) -> _T:
+    """The value, as a constant for differentiation."""
+    if namespace_of(value) is np:
+        return value
+    import jax
+
+    return jax.lax.stop_gradient(value)
 
 
 def to_device(value: Any, dtype: Any = None) -> Any:

@@ -181,7 +181,7 @@ class Parameter:
 class Constraint:
     """Linear constraint `least` <= sum of weight·parameter over `terms` <= `most`, in physical units.
 
-    Either may be None.
+    Either may be None; equal ones make an equality, as of the shares of a mixture.
     """
 
     terms: tuple[tuple[str, float], ...]
@@ -189,12 +189,24 @@ class Constraint:
     most: float | None = None
 
     @property
-    def words(self) -> str:
-        """Text of the constraint, such as `0 <= gain + 2 grains <= 24`."""
+    def equality(self) -> bool:
+        """Whether the sum must have one value."""
+        return self.least is not None and self.least == self.most
+
+    @property
+    def sum_words(self) -> str:
+        """Text of the sum, such as `gain + 2 grains`."""
         parts = [
             f"{'-' if w < 0 else '+'} {'' if abs(w) == 1 else f'{abs(w):g} '}{name}" for name, w in self.terms if w
         ]
-        total = " ".join(parts).removeprefix("+ ")
+        return " ".join(parts).removeprefix("+ ")
+
+    @property
+    def words(self) -> str:
+        """Text of the constraint, such as `0 <= gain + 2 grains <= 24` or `a + b = 1`."""
+        total = self.sum_words
+        if self.equality:
+            return f"{total} = {self.least:g}"
         low = "" if self.least is None else f"{self.least:g} <= "
         return low + total + ("" if self.most is None else f" <= {self.most:g}")
 
@@ -283,8 +295,12 @@ class Box:
         for key, end in (("least", least), ("most", most)):
             if end is not None and not math.isfinite(end):
                 raise InputError(f"{path}.{key} is {end}; it must be a finite number, or be left out.")
-        if least is not None and most is not None and not least < most:
+        if least is not None and most is not None and not least <= most:
             raise InputError(f"{path}.least is {least}; it must be below most = {most}.")
+        if constraint.equality and self.mechanics is not None:
+            raise InputError(
+                f"{path} is an equality, which is not possible where there is a [renderer]; write a least below most."
+            )
         self._check_size(constraint, path)
 
     def _check_size(self, constraint: Constraint, path: str) -> None:

@@ -32,6 +32,7 @@ __all__ = [
     "K1_interval",
     "K1_range",
     "allowed",
+    "balanced",
     "keeps",
     "largest_K1",
     "minimum_damping",
@@ -44,6 +45,7 @@ SEARCH_MARGIN = 1e-3
 # them.
 _ROUNDING = 64
 _SUM_ROUNDING = 8  # units of eps
+_EQUAL = 1e-9
 _Batch = Float[Array, "*batch"]
 _Physical = Mapping[str, Real[ArrayLike, "..."]]
 
@@ -129,6 +131,18 @@ def keeps(constraint: Constraint, physical: _Physical) -> Bool[Array, "..."]:
     low = -jnp.inf if constraint.least is None else constraint.least
     high = jnp.inf if constraint.most is None else constraint.most
     return (total >= low - slack) & (total <= high + slack)
+
+
+def balanced(constraint: Constraint, scale: float, physical: _Physical) -> Bool[Array, "..."]:
+    """Whether parameter sets satisfy a linear equality, to 1e-9 of its `scale` (64 eps in single precision).
+
+    `scale`: largest sum of the absolute terms within the ranges; `physical`: parameter -> values in its unit, of one
+    shape; so is the result.
+    """
+    assert constraint.least is not None
+    total = functools.reduce(jnp.add, (weight * jnp.asarray(physical[name]) for name, weight in constraint.terms))
+    slack = max(_EQUAL, _ROUNDING * float(jnp.finfo(total.dtype).eps))
+    return jnp.abs(total - constraint.least) <= slack * scale
 
 
 def K1_interval(

@@ -4,6 +4,9 @@ NumPy numbers, computed once for a space. A constraint is linear in physical uni
 scale that is in one is searched in its unit, from 0 at its low end to 1 at its high one. A wall is `MARGIN` of the
 ranges inside the specified inequality, so that rounding does not move a choice beyond it.
 
+An equality determines a dependent parameter (`equality`), which is eliminated from all walls: its column is 0, and its
+range becomes two walls, without a margin.
+
 If few points of the cube are feasible, others are found by hit and run (Smith 1984, Oper. Res. 32:1296): many chains,
 which all start at the centre of the largest inscribed ball.
 """
@@ -16,11 +19,13 @@ from jaxtyping import Bool, Float
 
 from hilbo.errors import InputError
 from hilbo.search.box import Constraint, Parameter
+from hilbo.search.equality import Solved, check_equalities, solved
 
 __all__ = ["MARGIN", "Walls", "check_room", "ends_of_rays", "inside", "rows_of"]
 
 MARGIN = 1e-9
 """Distance of the search's walls inside the specified inequalities, as a fraction of the ranges."""
+_FLAT = 1e-12  # length of a normal after the elimination, of 1 before: no influence
 _LEAST = 1e-6  # radius of the largest ball, in units of the ranges: less is no volume
 _CHAINS, _BURN_IN, _APART = 512, 200, 20  # steps of hit and run
 
@@ -28,7 +33,7 @@ _CHAINS, _BURN_IN, _APART = 512, 200, 20  # steps of hit and run
 class Walls(NamedTuple):
     """Polytope of the points w (d,) with `normals` (k, d) w <= `offsets` (k,), normals of length 1.
 
-    `source`: number of the constraint of each wall, from 1.
+    `source`: number of the constraint of each wall, from 1; 0 for the range of a dependent parameter.
     """
 
     normals: Float[np.ndarray, "k d"]
@@ -39,7 +44,8 @@ class Walls(NamedTuple):
 def rows_of(parameters: Sequence[Parameter], constraints: Sequence[Constraint], without: str | None = None) -> Walls:
     """Constraints as walls in coordinates that run linearly from 0 to 1 over each range, `MARGIN` inside.
 
-    One wall for each `least` and each `most`; constraints that involve the parameter `without` are left out.
+    One wall for each `least` and each `most` of an inequality, and two for each parameter that an equality determines;
+    constraints that involve the parameter `without` are left out.
     """
     names, low = [p.name for p in parameters], np.array([p.low for p in parameters])
     width = np.array([p.high for p in parameters]) - low
@@ -48,7 +54,7 @@ def rows_of(parameters: Sequence[Parameter], constraints: Sequence[Constraint], 
         weights = np.zeros(len(names))
         for name, weight in constraint.terms:
             weights[names.index(name)] = weight
-        if without is not None and weights[names.index(without)]:
+        if constraint.equality or (without is not None and weights[names.index(without)]):
             continue
         size = np.linalg.norm(weights * width)
         for side, end in ((1.0, constraint.most), (-1.0, constraint.least)):
@@ -56,11 +62,34 @@ def rows_of(parameters: Sequence[Parameter], constraints: Sequence[Constraint], 
                 normals.append(side * weights * width / size)
                 offsets.append(side * (end - weights @ low) / size - MARGIN)
                 source.append(number)
-    return Walls(np.array(normals).reshape(-1, len(names)), np.array(offsets), tuple(source))
+    walls = Walls(np.array(normals).reshape(-1, len(names)), np.array(offsets), tuple(source))
+    equalities = solved(tuple(parameters), tuple(constraints))
+    return walls if equalities is None else _eliminated(walls, equalities)
+
+
+def _eliminated(walls: Walls, equalities: Solved) -> Walls:
+    """Walls without the dependent parameters, and those of their ranges.
+
+    A wall on which the others have no influence is left out if it is kept; else its normal is 0, and no point keeps it.
+    """
+    at = list(equalities.dependent)
+    normals = walls.normals + walls.normals[:, at] @ equalities.matrix
+    normals[:, at] = 0.0
+    normals = np.concatenate([normals, equalities.matrix, -equalities.matrix])
+    offsets = walls.offsets - walls.normals[:, at] @ equalities.constant
+    offsets = np.concatenate([offsets, 1.0 - equalities.constant, equalities.constant])
+    source, sizes = np.array([*walls.source, *[0] * (2 * len(at))]), np.linalg.norm(normals, axis=1)
+    flat = sizes <= _FLAT
+    normals = np.where(flat[:, None], 0.0, normals / np.where(flat, 1.0, sizes)[:, None])
+    offsets = offsets / np.where(flat, 1.0, sizes)
+    left = ~flat | (offsets < 0)
+    return Walls(normals[left], offsets[left], tuple(source[left].tolist()))
 
 
 def check_room(parameters: Sequence[Parameter], constraints: Sequence[Constraint]) -> None:
-    """Raise `InputError` for constraints that leave no volume of the ranges, alone, in pairs or together."""
+    """Raise `InputError` for equalities that leave no freedom (`check_equalities`), and for constraints that leave no
+    volume of the ranges, alone, in pairs or together."""
+    check_equalities(tuple(parameters), tuple(constraints))
     if _radius(rows_of(parameters, constraints))[0] > _LEAST:
         return
     numbers = range(1, len(constraints) + 1)

@@ -8,6 +8,10 @@ Three coordinate systems:
   the fraction of a column along K1, from its first feasible point to its last (`columns`). A parameter in a linear
   constraint is linear in its unit (`linear`); all others are w = x.
 
+An equality, as of the shares of a mixture, determines a dependent parameter. Its coordinate of the box has no
+influence: `completed` computes it from the others, so that searches have one dimension less. In the unit cube, where
+kernels measure distances, all parameters count alike, whichever is the dependent one.
+
 Without constraints the polytope is the whole cube. With mechanics, a constraint on K1 bounds its column instead. Whole
 numbers and levels are discrete coordinates: a search changes the others, then tries `neighbours`.
 
@@ -29,12 +33,13 @@ from jaxtyping import Array, Bool, Float, Real
 from hilbo.errors import InputError
 from hilbo.numerics.host import floating, namespace_of, to_device
 from hilbo.numerics.polytope import Polytope
-from hilbo.numerics.tracing import program
 from hilbo.search import linear
 from hilbo.search.box import Box, Constraint, Mechanics, Parameter
-from hilbo.search.columns import Columns, check_volume, rosenblatt, volume
-from hilbo.search.feasibility import K0_of, allowed, keeps, minimum_damping, passive
-from hilbo.search.space_filling import HELD, Chunks, latin_chunks, sobol_chunks, spread_out, take, wall_chunks
+from hilbo.search.columns import Columns, check_volume, volume
+from hilbo.search.drawing import box_points, feasible_points, joined, take_feasible, unit_points
+from hilbo.search.equality import scale_of, solved, with_dependent
+from hilbo.search.feasibility import K0_of, allowed, balanced, keeps, minimum_damping, passive
+from hilbo.search.space_filling import HELD, latin_chunks, sobol_chunks, spread_out, take, wall_chunks
 from hilbo.search.steps import neighbours, steps_of
 
 __all__ = ["Bound", "SearchSpace", "share_of_cube"]
@@ -83,6 +88,23 @@ class SearchSpace(eqx.Module):
         return tuple(parameter.discrete for parameter in self.parameters)
 
     @property
+    def dependent(self) -> tuple[int, ...]:
+        """Indices of the parameters that equalities determine from the others."""
+        return self.determined() or ()
+
+    def determined(self, kept: tuple[int, ...] = ()) -> tuple[int, ...] | None:
+        """Indices of the parameters that `completed` computes; None if the `kept` ones leave nothing to compute."""
+        if not any(constraint.equality for constraint in self.constraints):
+            return ()
+        equalities = solved(self.parameters, self.constraints, kept)
+        return None if equalities is None else equalities.dependent
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Indices of the parameters that no equality determines; they span slices and figures."""
+        return tuple(i for i in range(self.dim) if i not in self.dependent)
+
+    @property
     def even(self) -> bool:
         """Whether all parameters are continuous and there are no constraints; mechanics are allowed."""
         return not self.constraints and not any(self.discrete)
@@ -91,16 +113,20 @@ class SearchSpace(eqx.Module):
     def searched(self) -> dict[str, Any]:
         """Keyword arguments of `acquisition.maximise` that describe this space: coordinate maps, `feasible`, and walls.
 
-        Walls, discrete coordinates and their neighbours only where the space is not `even`.
+        Walls, discrete coordinates and their neighbours only where the space is not `even`, dependent coordinates only
+        with equalities.
         """
         functions = {"from_box": self.from_box, "to_box": self.to_box, "feasible": self.feasible}
         if self.even:
             return functions
         walls, coupled = self._walls, bool(self.constraints)
         between = Polytope(jnp.asarray(walls.normals), jnp.asarray(walls.offsets))
+        dependent = [i in self.dependent for i in range(self.dim)]
+        if any(dependent):
+            functions["dependent"] = jnp.asarray(dependent)
         return functions | {
             "walls": between,
-            "held": jnp.asarray(self.discrete),
+            "held": jnp.asarray(self.discrete) | jnp.asarray(dependent),
             "neighbours": functools.partial(neighbours, self.parameters, coupled) if any(self.discrete) else None,
         }
 
@@ -176,6 +202,8 @@ class SearchSpace(eqx.Module):
         w = _on_device(w)
         for i, (p, linear_in_box) in enumerate(zip(self.parameters, self._linear, strict=True)):
             w = w.at[..., i].set(p.to_unit(p.low + (p.high - p.low) * w[..., i])) if linear_in_box else w
+        if self.dependent:
+            return self.completed(w)
         return w if self.columns is None else self.columns.from_shares(w)
 
     def to_box(self, x: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
@@ -189,6 +217,18 @@ class SearchSpace(eqx.Module):
         for i, (p, linear_in_box) in enumerate(zip(self.parameters, self._linear, strict=True)):
             w = w.at[..., i].set((p.to_physical(x[..., i]) - p.low) / (p.high - p.low)) if linear_in_box else w
         return w if self.columns is None else self.columns.to_shares(w, x)
+
+    def completed(self, x: Real[ArrayLike, "*batch d"], kept: tuple[int, ...] = ()) -> Float[Array, "*batch d"]:
+        """Points of the unit cube with the dependent parameters computed from the others; `x` without equalities.
+
+        `kept`: indices of parameters that stay as they are, so that others are the dependent ones; `x` itself if that
+        is not possible. (..., d) -> (..., d). A dependent parameter may come out beyond its range; differentiable.
+        """
+        equalities, points = solved(self.parameters, self.constraints, kept), floating(x)
+        if equalities is None:
+            return to_device(points)
+        self._check_axis(points)
+        return to_device(with_dependent(self.parameters, equalities, points))
 
     def feasible(self, x: Real[ArrayLike, "*batch d"]) -> Bool[Array, "*batch"]:
         """Whether points of the unit cube are in it, passive with the search margin, and within all constraints.
@@ -205,16 +245,19 @@ class SearchSpace(eqx.Module):
         if self.mechanics is not None:
             inside &= allowed(self.mechanics, self._split(physical))
         for constraint in self.constraints:
-            inside &= keeps(constraint, self._split(physical))
+            inside &= self._keeps(constraint, self._split(physical))
         return inside
 
     def broken(self, x: Real[ArrayLike, " d"]) -> Bound | None:
         """Boundary that a point (d,) of the unit cube violates; None if it violates none.
 
-        Constraints are reported first, then passivity, then effective damping. The ends of the ranges are not checked.
+        Constraints are reported first, then passivity, then effective damping. The ends of the ranges are not checked,
+        but for dependent parameters, where they count as the constraint.
         """
-        physical = self._split(self.to_physical(_on_device(x)))
-        if not all(keeps(constraint, physical) for constraint in self.constraints):
+        points, dependent = _on_device(x), [i for c in self.constraints if c.equality for i in self._of(c)]
+        beyond = any(not 0 <= float(points[i]) <= 1 for i in dependent)
+        physical = self._split(self.to_physical(points))
+        if beyond or not all(self._keeps(constraint, physical) for constraint in self.constraints):
             return "constraint"
         if self.mechanics is None or allowed(self.mechanics, physical):
             return None
@@ -255,7 +298,7 @@ class SearchSpace(eqx.Module):
         """
         if self.constraints and self.mechanics is None:
             return _take_between(self, m, seed)
-        return _take_feasible(self, m, sobol_chunks(self.dim, m, seed), self._drawn)
+        return take_feasible(self, m, sobol_chunks(self.dim, m, seed), self._drawn)
 
     def walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points on the boundary of the feasible set (walls, edges, corners), including the passivity boundary.
@@ -266,7 +309,7 @@ class SearchSpace(eqx.Module):
             return self._on_walls(m, seed)
         count = 2 ** max(m - 1, 0).bit_length()
         chunks, held = sobol_chunks(self.dim, count, seed), wall_chunks(self.dim, count, seed)
-        return _take_feasible(self, m, chunks, self.columns, held)
+        return take_feasible(self, m, chunks, self.columns, held)
 
     def latin_hypercube(self, n: int, seed: int) -> Float[np.ndarray, "n d"]:
         """`n` feasible points of the unit cube: a Latin hypercube in the coordinates in which the set is uniform.
@@ -277,7 +320,7 @@ class SearchSpace(eqx.Module):
         """
         if self.constraints and n:
             return spread_out(self.candidates(_CLUSTERED * n, seed), n, seed)
-        return _take_feasible(self, n, latin_chunks(self.dim, n, seed), self._drawn)
+        return take_feasible(self, n, latin_chunks(self.dim, n, seed), self._drawn)
 
     def _on_walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """Points (m, d) on the walls of the constraints and of the cube, for a space without mechanics.
@@ -285,9 +328,20 @@ class SearchSpace(eqx.Module):
         If rounding makes such a point infeasible, the interior point it was found from takes its place.
         """
         starts, free = self.candidates(m, seed + 1), ~np.array(self.discrete)
-        ends = linear.ends_of_rays(self._walls, np.asarray(_to_box(self, starts)), free, seed, HELD)
-        x, feasible = _from_box(self, ends)
+        free[list(self.dependent)] = False
+        ends = linear.ends_of_rays(self._walls, np.asarray(box_points(self, starts)), free, seed, HELD)
+        x, feasible = unit_points(self, ends)
         return np.where(np.asarray(feasible)[:, None], np.asarray(x), starts)
+
+    def _keeps(self, constraint: Constraint, physical: Mapping[str, Float[Array, "*batch"]]) -> Bool[Array, "*batch"]:
+        """Whether parameter sets satisfy a constraint. `physical`: parameter -> values in its unit, (...,) each."""
+        if not constraint.equality:
+            return keeps(constraint, physical)
+        return balanced(constraint, scale_of(constraint, self.parameters), physical)
+
+    def _of(self, constraint: Constraint) -> list[int]:
+        """Indices of the parameters in a constraint."""
+        return [self.names.index(name) for name, weight in constraint.terms if weight]
 
     def _split(self, physical: Float[Array, "*batch d"]) -> dict[str, Float[Array, "*batch"]]:
         """Coordinates by parameter name, each (...,)."""
@@ -301,9 +355,9 @@ def _on_device(x: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
 
 @functools.lru_cache(maxsize=16)
 def share_of_cube(space: SearchSpace) -> float:
-    """Feasible fraction of the unit cube, estimated from 4096 points; cached."""
+    """Feasible fraction of the unit cube of the free parameters, estimated from 4096 points; cached."""
     points = next(sobol_chunks(space.dim, _PILOT, 0))
-    return float(np.asarray(_feasible(space, steps_of(space.parameters, points))).mean())
+    return float(np.asarray(feasible_points(space, space.completed(steps_of(space.parameters, points)))).mean())
 
 
 def _take_between(space: SearchSpace, count: int, seed: int) -> Float[np.ndarray, "count d"]:
@@ -313,71 +367,10 @@ def _take_between(space: SearchSpace, count: int, seed: int) -> Float[np.ndarray
     """
     chunks = sobol_chunks(space.dim, count, seed)
     if share_of_cube(space) < _ROOMY:
-        chunks = (np.asarray(_from_box(space, w)[0]) for w in linear.inside(space._walls, count, seed))
+        chunks = (np.asarray(unit_points(space, w)[0]) for w in linear.inside(space._walls, count, seed))
 
     def place(uniform):
-        x = steps_of(space.parameters, uniform)
-        return x, np.asarray(_feasible(space, x))
+        x = np.asarray(space.completed(steps_of(space.parameters, uniform)))
+        return x, np.asarray(feasible_points(space, x))
 
-    return _joined(space, count, *take(count, chunks, place))
-
-
-@program
-def _feasible(space: SearchSpace, x: Float[ArrayLike, "n d"]) -> Bool[Array, " n"]:
-    """`SearchSpace.feasible`, compiled."""
-    return space.feasible(x)
-
-
-@program
-def _to_box(space: SearchSpace, x: Float[ArrayLike, "n d"]) -> Float[Array, "n d"]:
-    """`SearchSpace.to_box`, compiled."""
-    return space.to_box(x)
-
-
-@program
-def _from_box(space: SearchSpace, w: Float[ArrayLike, "n d"]) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
-    """`SearchSpace.from_box`, compiled: points of the unit cube, and whether each is feasible."""
-    x = space.from_box(w)
-    return x, space.feasible(x)
-
-
-@program
-def _from_columns(
-    space: SearchSpace, columns: Columns, w: Float[ArrayLike, "n d"]
-) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
-    """Points of the unit cube from `w`, whose K1 is a share of its column, and whether each is feasible; compiled."""
-    x = columns.from_shares(_on_device(w))
-    return x, space.feasible(x)
-
-
-def _take_feasible(
-    space: SearchSpace, count: int, chunks: Chunks, columns: Columns | None, hold: Chunks | None = None
-) -> Float[np.ndarray, "count d"]:
-    """Take the first `count` feasible points out of chunks of uniform numbers; points of the unit cube.
-
-    `columns`: K1 is drawn within them; None: points are drawn in the box coordinates. `hold`: chunks of the same sizes
-    with the coordinates that are fixed at an end, NaN for free ones. Raises `InputError` for too few.
-    """
-
-    def place(uniform):
-        w = uniform if columns is None else rosenblatt(columns.drawn, uniform)
-        if hold is not None:
-            ends = next(hold)
-            w = np.where(np.isnan(ends), w, ends)
-        w = steps_of(space.parameters, w)
-        x, feasible = _from_box(space, w) if columns is None else _from_columns(space, columns, w)
-        return np.asarray(x), np.asarray(feasible)
-
-    return _joined(space, count, *take(count, chunks, place))
-
-
-def _joined(
-    space: SearchSpace, count: int, kept: list[Float[np.ndarray, "_ d"]], taken: int, tried: int
-) -> Float[np.ndarray, "count d"]:
-    """Concatenate the arrays of points in `kept`. Raises `InputError` if `taken` is fewer than `count` (of `tried`)."""
-    if taken < count:
-        left = f"{taken} of {tried} {'points' if space.mechanics is None else 'passive points'}, too few to search"
-        if space.constraints:
-            raise InputError(f"constraints leave {left}; widen them.")
-        raise InputError(f"renderer.effective_damping leaves {left}; widen it.")
-    return np.concatenate(kept) if kept else np.zeros((0, space.dim))
+    return joined(space, count, *take(count, chunks, place))

@@ -13,6 +13,7 @@ import numpy as np
 
 from hilbo.errors import InputError
 from hilbo.likelihoods import Goal
+from hilbo.search.equality import unbalanced
 from hilbo.search.rendering import Rendering
 from hilbo.simulation.simulate import Population
 from hilbo.study.config import Study
@@ -88,6 +89,12 @@ def _of_these_ranges(study: Study, population: Population) -> bool:
 def _stated(study: Study, table: SimulationTable) -> Population:
     """Population specified in a [simulation] table."""
     dim = study.space.dim
+    for constraint in (c for c in study.space.constraints if c.equality and table.truth):
+        (total,), (wrong,) = unbalanced(constraint, {k: np.array([v]) for k, v in table.truth.items()}, np.zeros(1))
+        if wrong:
+            raise InputError(
+                f"simulation.truth: {constraint.sum_words} is {total:g}; it must be {constraint.least:g} in this study."
+            )
     return Population(
         truth={p.name: p.number(table.truth[p.name]) for p in study.space.parameters} if table.truth else {},
         spread=each(table.spread, dim),

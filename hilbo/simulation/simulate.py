@@ -130,6 +130,7 @@ def people(study: Study, population: Population, count: int, seed: int) -> Perso
             break
         drawn = truth + np.array(population.spread) * rng.standard_normal((64, study.space.dim))
         drawn = _with_levels(drawn, levels, truth, population.spread, rng) if levels else drawn
+        drawn = np.asarray(study.space.completed(drawn))
         within = np.clip(drawn, 0, 1)
         liked = np.all(drawn == within, axis=1) & np.asarray(study.space.feasible(within))
         optima = np.concatenate([optima, drawn[liked]])

@@ -83,7 +83,7 @@ class Maps:
             p.name: {"unit": p.unit, "scale": p.scale, "low": p.low, "high": p.high, "levels": p.levels}
             for p in parameters
         }
-        if len(parameters) == 1:
+        if len(self._chooser.study(block).space.free) == 1:
             ranges[_ANSWER] = {"unit": "", "scale": "linear", "low": 0, "high": 1, "levels": state.study.responses}
         return {"slices": slices, "ranges": ranges}
 
@@ -91,19 +91,19 @@ class Maps:
         """The slices after some answers, as dicts for JSON. `asked`: parameters of the rendering that is presented, in
         physical units, or None."""
         study, fitted = self._chooser.study(answers.block), self._chooser.fitted(answers)
-        names = study.space.names
         best = self._chooser.best(answers.block, fitted)
         maps: _Slices = jax.device_get(_slices(study, fitted.posterior, best))
         marks = np.asarray(fitted.posterior.trials.x)[: len(answers.categories)]
         levels = np.array(answers.categories, int) / (len(study.responses) - 1)
         felt = None if asked is None else Rendering.of(study.space, asked).unit
-        pairs = enumerate(_pairs(len(names)))
+        pairs = enumerate(_pairs(study.space.free))
         return [_slice(study, maps, k, pair, marks, levels, felt) for k, pair in pairs]
 
 
-def _pairs(dim: int) -> list[_Pair]:
-    """Indices of the parameters on the horizontal and vertical axis of each slice; (0, None) for a single parameter."""
-    return [*itertools.combinations(range(dim), 2)] or [(0, None)]
+def _pairs(free: tuple[int, ...]) -> list[_Pair]:
+    """Indices of the parameters on the horizontal and vertical axis of each slice, of those that are `free`; (index,
+    None) for a single one."""
+    return [*itertools.combinations(free, 2)] or [(free[0], None)]
 
 
 class _Slices(NamedTuple):
@@ -121,8 +121,9 @@ def _slice(study, maps: _Slices, k: int, pair: _Pair, marks, levels, felt) -> di
     answer's height is its level. `marks` (n, d) and `levels` (n,), on [0, 1]: the answers; `felt` (d,): the present
     rendering, or None. Points are in the unit cube."""
     best, names, parameters = maps.best, study.space.names, study.space.parameters
-    others = [i for i in range(len(names)) if i not in pair]
+    others = [i for i in study.space.free if i not in pair]
     held = [_held(parameters[i], float(best[i])) for i in others]
+    held += [f"the {names[i]} that completes the sum" for i in study.space.dependent]
     across, up = pair
 
     def dot(x: Float[np.ndarray, " d"], height: float) -> dict[str, float]:
@@ -180,10 +181,10 @@ def _slices(study: Study, posterior: Posterior, physical: Float[Array | np.ndarr
     best = study.space.to_unit(physical)
     axes = [jnp.asarray(_axis(p), best.dtype) for p in study.space.parameters]
     grids = []
-    for i, j in _pairs(study.space.dim):
+    for i, j in _pairs(study.space.free):
         up, across = jnp.meshgrid(axes[i if j is None else j], axes[i], indexing="ij")
         grid = jnp.broadcast_to(best, (_SIDE * _SIDE, best.shape[0])).at[:, i].set(across.ravel())
         grids.append(grid if j is None else grid.at[:, j].set(up.ravel()))
-    points = jnp.concatenate(grids)
+    points = study.space.completed(jnp.concatenate(grids))
     shape = (len(grids), _SIDE, _SIDE)
     return _Slices(best, posterior.mean(points).reshape(shape), study.space.feasible(points).reshape(shape))

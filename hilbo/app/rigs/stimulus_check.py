@@ -29,9 +29,10 @@ class Measured(NamedTuple):
 
 
 def _example(study: StudyFile) -> dict[str, float]:
-    """A rendering of a study, as orders have it: the middle of all ranges; with [renderer] a passive one, with K0."""
+    """A rendering of a study, as orders have it: the middle of all ranges; with [renderer] a passive one, with K0,
+    and with an equality one that satisfies it."""
     space = study.space
-    if space.mechanics is None:
+    if space.mechanics is None and not any(constraint.equality for constraint in space.constraints):
         middles = ((p, p.middle) for p in space.parameters)
         return {p.name: float(round(middle)) if p.discrete else middle for p, middle in middles}
     from hilbo.search.rendering import Rendering

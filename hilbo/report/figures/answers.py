@@ -26,12 +26,13 @@ _CORNERS = 60  # of a whole disc
 def mark_trials(axes, study: Study, cohort: Cohort, third: float | None) -> Int[np.ndarray, " p"]:
     """Draw the responses near a slice on `axes`: one mark for each, or a pie marker for several at one point.
 
-    `third`: value of the third parameter on the slice (unit cube), of which trials within 0.08 are drawn; None: all.
-    Returns the number of responses at each point drawn, (p,).
+    `third`: value of the third free parameter on the slice (unit cube), of which trials within 0.08 are drawn;
+    None: all. Returns the number of responses at each point drawn, (p,).
     """
     x, q = _answers(cohort)
-    near = np.ones(len(x), bool) if third is None else np.abs(x[:, 2] - third) < _NEAR
-    points = np.asarray(study.space.to_physical(x))[near, :2]
+    free = study.space.free
+    near = np.ones(len(x), bool) if third is None else np.abs(x[:, free[2]] - third) < _NEAR
+    points = np.asarray(study.space.to_physical(x))[near][:, list(free[:2])]
     places, place, counts = np.unique(points, axis=0, return_inverse=True, return_counts=True)
     place = place.reshape(-1)  # NumPy 2.0 gives it the shape of the points
     alone = counts[place] == 1
@@ -50,7 +51,7 @@ def mark_along(axes, study: Study, cohort: Cohort) -> Int[np.ndarray, " p"]:
     where the same response was given more often. Returns the number of responses of each mark, (p,).
     """
     x, q = _answers(cohort)
-    points, places = np.asarray(study.space.to_physical(x))[:, 0], axes.get_xaxis_transform()
+    points, places = np.asarray(study.space.to_physical(x))[:, study.space.free[0]], axes.get_xaxis_transform()
     marks = [np.unique(points[q == category], return_counts=True) for category in range(len(study.responses))]
     counts = np.concatenate([number for _, number in marks])
     for category, (shown, number) in enumerate(marks):

@@ -45,6 +45,7 @@ from hilbo.study.estimate.optimum import predict_map
 __all__ = [
     "Plane",
     "Slice",
+    "along",
     "curve",
     "draw_curve",
     "grid_slice",
@@ -56,6 +57,8 @@ __all__ = [
     "optima_scatter",
     "plane",
     "slices_after",
+    "third_of",
+    "third_words",
 ]
 
 _CELLS = 101
@@ -68,7 +71,7 @@ Surface = Callable[..., tuple[Any, Any]]
 
 
 class Slice(NamedTuple):
-    """Mean and standard deviation (r, c) of a map over the first two parameters, NaN where not feasible; and the
+    """Mean and standard deviation (r, c) of a map over the first two free parameters, NaN where not feasible; and the
     physical values of these parameters (c,) and (r,)."""
 
     mean: Float[np.ndarray, "r c"]
@@ -79,23 +82,25 @@ class Slice(NamedTuple):
 def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
     """Slices of the population map's mean through the optimum, with trials near them; infeasible points are white.
 
-    The first two parameters span the slices; there is one at the optimum's value of the third, and one on either side.
-    Further parameters stay at the optimum. With one parameter, the map is a curve with its standard deviation.
+    The first two free parameters span the slices; there is one at the optimum's value of the third, and one on either
+    side. Further ones stay at the optimum, and dependent ones follow from the study's equalities. With one free
+    parameter, the map is a curve with its standard deviation.
     `surface`: the map's mean and variance at points (m, d) of the unit cube; `optimum` (d,): in the unit cube.
     """
-    if study.space.dim == 1:
+    if len(study.space.free) == 1:
         return _map_curve(study, surface, optimum, cohort)
-    thirds = [None] if study.space.dim == 2 else _slice_values(study.space.parameters[2], float(optimum[2]))
+    at = third_of(study)
+    thirds = [None] if at is None else _slice_values(study.space.parameters[at], float(optimum[at]))
     grids = [grid_slice(study, surface, optimum, third) for third in thirds]
     figure, panels, draw = map_panels(study, grids)
     counts = []
     for axes, third, values in zip(panels, thirds, grids, strict=True):
         draw(axes, values)
         counts.append(mark_trials(axes, study, cohort, third))
-        here = third is None or third == float(optimum[2])
+        here = at is None or third == float(optimum[at])
         if here:
             star(axes, study, optimum)
-        title(axes, "" if third is None else level_words(study, 2, third) + (" (optimum)" if here else ""))
+        title(axes, third_words(study, third) + (" (optimum)" if at is not None and here else ""))
     legend(figure, [*answer_handles(study, np.concatenate(counts)), *map_handles(study)])
     return figure
 
@@ -113,9 +118,10 @@ def maps_beside(study: Study, maps: Mapping[str, Surface], optima: Float[np.ndar
 
     `optima` (k, d): in the unit cube, in the order of the maps. With one parameter the means are curves on one panel.
     """
-    if study.space.dim == 1:
+    if len(study.space.free) == 1:
         return _curves_beside(study, maps, optima)
-    thirds = [float(x[2]) if study.space.dim > 2 else None for x in optima]
+    at = third_of(study)
+    thirds = [None if at is None else float(x[at]) for x in optima]
     grids = [
         grid_slice(study, surface, x, third) for surface, x, third in zip(maps.values(), optima, thirds, strict=True)
     ]
@@ -123,7 +129,7 @@ def maps_beside(study: Study, maps: Mapping[str, Surface], optima: Float[np.ndar
     for axes, name, x, third, values in zip(panels, maps, optima, thirds, grids, strict=True):
         draw(axes, values)
         star(axes, study, x)
-        title(axes, name + (f", {level_words(study, 2, third)}" if third is not None else ""))
+        title(axes, third_words(study, third, f"{name}, ") or name)
     return figure
 
 
@@ -202,7 +208,7 @@ def map_panels(study: Study, grids):
     bar = figure.colorbar(scale, ax=panels, label=score_label(study), fraction=0.05, pad=0.02)
     few_ticks(bar.ax.yaxis, 5)
     for axes in panels:
-        label_axes(axes, study, 0, 1)
+        label_axes(axes, study, *study.space.free[:2])
     for axes in panels[1:]:
         axes.set_ylabel("")
 
@@ -223,7 +229,7 @@ def map_panels(study: Study, grids):
 
 def _has_lines(study: Study) -> bool:
     """Whether a map has contours: not if one of the first two parameters is categorical."""
-    return not any(p.levels for p in study.space.parameters[:2])
+    return not any(study.space.parameters[i].levels for i in study.space.free[:2])
 
 
 def map_handles(study: Study) -> list[Any]:
@@ -247,44 +253,67 @@ class Plane(NamedTuple):
         return np.where(self.feasible, np.asarray(values).reshape(self.feasible.shape), np.nan)
 
 
-def plane(study: Study, point: Float[ArrayLike, " d"], pair: tuple[int, int] = (0, 1), cells: int = _CELLS) -> Plane:
+def third_of(study: Study) -> int | None:
+    """Index of the third free parameter, at values of which slices are shown; None if there are two or one."""
+    return study.space.free[2] if len(study.space.free) > 2 else None
+
+
+def third_words(study: Study, third: float | None, before: str = "") -> str:
+    """Text `before` and the third free parameter with its value `third` (unit cube) on a slice; "" if that is None."""
+    at = third_of(study)
+    return "" if at is None or third is None else before + level_words(study, at, third)
+
+
+def plane(study: Study, point: Float[ArrayLike, " d"], pair: tuple[int, int], cells: int = _CELLS) -> Plane:
     """Grid of `cells` values of each of two parameters (fewer for discrete ones), with the others as in `point` (d,) of
-    the unit cube. `pair`: indices of the parameters across and up.
+    the unit cube, but those that the study's equalities determine. `pair`: indices of the parameters across and up.
     """
     searched = [study.space.parameters[k] for k in pair]
     axes = [p.axis(cells) for p in searched]
     grid = np.tile(np.asarray(point, float), (len(axes[1]), len(axes[0]), 1))
     grid[..., pair[0]], grid[..., pair[1]] = np.meshgrid(*axes)
-    points = grid.reshape(-1, grid.shape[-1])
+    points = np.asarray(study.space.completed(grid.reshape(-1, grid.shape[-1]), pair))
     across, up = (np.asarray(p.to_physical(axis)) for p, axis in zip(searched, axes, strict=True))
     return Plane(points, (across, up), np.asarray(study.space.feasible(points)).reshape(grid.shape[:-1]))
 
 
 def grid_slice(study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], third: float | None) -> Slice:
-    """Mean and standard deviation of a map over the first two parameters, NaN where not feasible.
+    """Mean and standard deviation of a map over the first two free parameters, NaN where not feasible.
 
-    `optimum` (d,) of the unit cube: where the other parameters are; `third`: value of the third parameter instead, or
+    `optimum` (d,) of the unit cube: where the other parameters are; `third`: value of the third one instead, or
     None. `surface`: points (m, d) -> mean and variance (m,).
     """
     point = np.array(optimum, float)
     if third is not None:
-        point[2] = third
-    grid = plane(study, point)
+        point[third_of(study)] = third
+    across, up = study.space.free[:2]
+    grid = plane(study, point, (across, up))
     mean, variance = map(grid.image, surface(to_device(grid.points)))
     return Slice(mean, np.sqrt(variance), grid.sides)
 
 
 def curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Physical values, mean and standard deviation of a map of one parameter, (m,) each; of a discrete one at its
-    values alone."""
-    side = np.asarray(study.space.parameters[0].axis(_CELLS))
-    mean, variance = surface(to_device(side[:, None]))
-    return np.asarray(study.space.parameters[0].to_physical(side)), np.asarray(mean), np.sqrt(np.asarray(variance))
+    """Physical values, mean and standard deviation of a map of one free parameter, (m,) each; of a discrete one at its
+    values alone. NaN where an equality leaves nothing."""
+    side, points = along(study)
+    mean, variance = surface(to_device(points))
+    inside = np.asarray(study.space.feasible(points))
+    mean, sd = np.where(inside, np.asarray(mean), np.nan), np.where(inside, np.sqrt(np.asarray(variance)), np.nan)
+    return np.asarray(study.space.parameters[study.space.free[0]].to_physical(side)), mean, sd
+
+
+def along(study: Study) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m d"]]:
+    """Values (m,) of the only free parameter on [0, 1], and their points (m, d) of the unit cube."""
+    index = study.space.free[0]
+    side = np.asarray(study.space.parameters[index].axis(_CELLS))
+    points = np.zeros((len(side), study.space.dim))
+    points[:, index] = side
+    return side, np.asarray(study.space.completed(points))
 
 
 def label_curve(axes, study: Study) -> None:
     """Label `axes` for a map of one parameter: its values across, the latent score up."""
-    label_axes(axes, study, 0, 0)
+    label_axes(axes, study, *2 * study.space.free[:1])
     axes.set(yscale="linear", ylabel=score_label(study))
 
 
@@ -307,7 +336,7 @@ def _map_curve(study, surface, optimum, cohort):
     figure, axes = new_figure(ONE_COLUMN, 2.5)
     draw_curve(axes, study, curve(study, surface), "± standard deviation", "population map")
     counts = mark_along(axes, study, cohort)
-    best = np.asarray(study.space.to_physical(np.asarray(optimum)))[0]
+    best = np.asarray(study.space.to_physical(np.asarray(optimum)))[study.space.free[0]]
     axes.axvline(float(best), color=RED, linewidth=1, label="optimum")
     legend(figure, [*axes.get_legend_handles_labels()[0], *answer_handles(study, counts, discs=False)])
     return figure
@@ -321,7 +350,7 @@ def _curves_beside(study, maps, optima):
     for (name, surface), x, colour in zip(maps.items(), optima, (ORANGE, GREEN, BLUE, RED), strict=False):
         physical, mean, _ = curve(study, surface)
         axes.plot(physical, mean, color=colour, label=name)
-        best = float(np.asarray(study.space.to_physical(np.asarray(x)))[0])
+        best = float(np.asarray(study.space.to_physical(np.asarray(x)))[study.space.free[0]])
         axes.plot(best, np.interp(best, physical, mean), "*", color=colour, markersize=11, markeredgecolor="white")
     axes.autoscale(axis="y")
     axes.legend(frameon=False)

@@ -33,27 +33,34 @@ def plot_map(
 
     **Arguments:**
 
-    - `pair`: names of the parameters across and up; the first two without it. Of a study with one parameter the mean is
-      drawn as a curve with its standard deviation.
+    - `pair`: names of the parameters across and up; without it the first two free ones. Of a study with one free
+      parameter the mean is drawn as a curve with its standard deviation.
     - `ax`: the axes to draw on; without it those of a new figure of pyplot, which notebooks show.
 
     **Returns:** the axes. Infeasible stimuli are left white, the maximum is a star; the values of the other parameters
-    are in the title. Raises `InputError` for parameters that the study does not have, and for a model of another type.
+    are in the title, but those that an equality determines. Raises `InputError` for parameters that the study does not
+    have, and for a model of another type.
     """
-    names = study.space.names
+    names, free = study.space.names, study.space.free
     axes = _new_axes() if ax is None else ax
     best = _maximum(study, model)
-    if len(names) == 1 and pair is None:
+    if len(free) == 1 and pair is None:
         draw_curve(axes, study, curve(study, partial(_mean_and_variance, model)))
         return axes
-    i, j = _places(names, names[:2] if pair is None else pair)
+    i, j = _places(names, [names[k] for k in free[:2]] if pair is None else pair)
+    dependent = study.space.determined((i, j))
+    if dependent is None:
+        words = " and ".join(c.words for c in study.space.constraints if c.equality)
+        raise InputError(
+            f"plot_map: {names[i]} and {names[j]} are not free of each other ({words}); give another pair."
+        )
     grid = plane(study, best, (i, j), _CELLS)
     mean = grid.image(_mean_and_variance(model, grid.points)[0])
     drawn = axes.pcolormesh(*grid.sides, mean, cmap="cividis", shading="nearest", rasterized=True)
     axes.figure.colorbar(drawn, ax=axes, label=f"{score_label(study)} (mean)")
     label_axes(axes, study, i, j)
     star(axes, study, best, (i, j))
-    held = [level_words(study, k, float(best[k])) for k in range(len(names)) if k not in (i, j)]
+    held = [level_words(study, k, float(best[k])) for k in range(len(names)) if k not in (i, j, *dependent)]
     axes.set_title(", ".join(held))
     return axes
 

@@ -73,27 +73,28 @@ def reliability_figure(content: dict[str, Any]) -> Figure:
 def coverage_figure(
     study: Study, predict: Callable[..., Any], point: Float[np.ndarray, " d"], prior: float, limit: float = 0.8
 ) -> Figure:
-    """Standard deviation of the map over that without responses, on the slice of the first two parameters through
-    `point` (d,) of the unit cube; hatched where it is above `limit`.
+    """Standard deviation of the map over that without responses, on the slice of the first two free parameters
+    through `point` (d,) of the unit cube; hatched where it is above `limit`.
 
     `predict`: points (m, d) -> mean and variance (m,); `prior`: variance of the map without responses.
     """
     figure, axes = new_figure(ONE_COLUMN, 2.9)
     hatch = {"hatch": "///", "facecolor": "none", "edgecolor": GREY, "linewidth": 0}
-    if study.space.dim == 1:
+    if len(study.space.free) == 1:
         along, _, sd = curve(study, predict)
         ratio = sd / np.sqrt(prior)
         unknown = ratio > limit
         axes.plot(along, ratio, color=BLUE)
         axes.bar(along[unknown], 1.0, np.gradient(along)[unknown], **hatch)
-        label_axes(axes, study, 0, 0)
+        label_axes(axes, study, *2 * study.space.free[:1])
         axes.set(ylabel="sd of the map, over that without answers", yscale="linear", ylim=(0, 1.05))
     else:
-        grid = plane(study, point, cells=_CELLS)
+        across, up = study.space.free[:2]
+        grid = plane(study, point, (across, up), cells=_CELLS)
         ratio = grid.image(np.sqrt(np.asarray(predict(to_device(grid.points))[1]) / prior))
         shown = axes.pcolormesh(*grid.sides, ratio, cmap="cividis", vmin=0, vmax=1, shading="nearest", rasterized=True)
         unknown = np.ma.masked_where(~(ratio > limit), ratio)
         axes.pcolor(*grid.sides, unknown, shading="nearest", rasterized=True, **hatch)
         figure.colorbar(shown, ax=axes, label="sd of the map, over that without answers")
-        label_axes(axes, study, 0, 1)
+        label_axes(axes, study, across, up)
     return figure

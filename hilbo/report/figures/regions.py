@@ -11,14 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from hilbo.report.figures.maps import plane
+from hilbo.report.figures.maps import along, plane
 from hilbo.report.figures.style import RED, TWO_COLUMNS, label_axes, legend, new_figure, plain, star, styled, title
 from hilbo.study.analysis.analysis import Reading
 from hilbo.study.analysis.tolerance import slice_through
 
 __all__ = ["class_regions"]
-
-_CELLS = 101  # along a side
 
 
 @styled
@@ -26,18 +24,18 @@ def class_regions(readings: Mapping[str, Reading]) -> Figure:
     """The most probable response around the optimum of each of several analyses, and its tolerance intervals. Paper,
     figure 8.
 
-    One row for each reading (fixed and optimised hyperparameters), with slices of the first parameter with the second
-    and with the third; of two parameters or one, the readings are side by side. White: infeasible.
+    One row for each reading (fixed and optimised hyperparameters), with slices of the first free parameter with the
+    second and with the third; of two free parameters or one, the readings are side by side. White: infeasible.
     """
     study = next(iter(readings.values())).study
-    d, labels = study.space.dim, [*map(plain, study.responses)]
-    pairs = [(0, 1), (0, 2)] if d > 2 else [(0, d - 1)]
+    free, labels = study.space.free, [*map(plain, study.responses)]
+    pairs = [(free[0], j) for j in (free[1:3] or free)]
     shades = ListedColormap(mpl.colormaps["cividis"](np.linspace(0.12, 1.0, len(labels))))
     rows, across = (len(readings), len(pairs)) if len(pairs) > 1 else (1, len(readings))
     figure, grid = new_figure(TWO_COLUMNS, 2.4 * rows + 0.4, rows, across, squeeze=False)
     for (name, reading), row in zip(readings.items(), grid.reshape(len(readings), len(pairs)), strict=True):
         for axes, (i, j) in zip(row, pairs, strict=True):
-            if d == 1:
+            if len(free) == 1:
                 _class_curves(axes, reading, shades)
             else:
                 _regions(axes, reading, i, j, shades)
@@ -86,12 +84,14 @@ def _class_curves(axes, reading, shades):
     the tolerance interval if there is one.
     """
     study = reading.study
-    side = jnp.asarray(study.space.parameters[0].axis(_CELLS))
-    physical_side = np.asarray(study.space.parameters[0].to_physical(side))
-    chances = np.asarray(_probabilities(reading, side[:, None])).T
-    label_axes(axes, study, 0, 0)
+    index = study.space.free[0]
+    side, points = along(study)
+    side, points = (values[np.asarray(study.space.feasible(points))] for values in (side, points))
+    physical_side = np.asarray(study.space.parameters[index].to_physical(side))
+    chances = np.asarray(_probabilities(reading, jnp.asarray(points))).T
+    label_axes(axes, study, index, index)
     axes.stackplot(physical_side, chances, colors=[shades(k) for k in range(len(chances))])
-    interval, _ = reading.tolerances.get(study.space.parameters[0].name, (None, None))
+    interval, _ = reading.tolerances.get(study.space.parameters[index].name, (None, None))
     if interval is not None:
         axes.hlines(0.5, interval.low, interval.high, color=RED, linewidth=2)
     axes.set(yscale="linear", ylabel="probability of each answer", ylim=(0, 1))

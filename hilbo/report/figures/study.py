@@ -16,14 +16,23 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from hilbo.report.figures.answers import answer_handles, mark_trials
-from hilbo.report.figures.maps import Slice, curve, draw_curve, grid_slice, map_handles, map_panels, maps_beside
+from hilbo.report.figures.maps import (
+    Slice,
+    curve,
+    draw_curve,
+    grid_slice,
+    map_handles,
+    map_panels,
+    maps_beside,
+    third_of,
+    third_words,
+)
 from hilbo.report.figures.style import (
     GREEN,
     ONE_COLUMN,
     ORANGE,
     RED,
     legend,
-    level_words,
     new_figure,
     star,
     styled,
@@ -58,9 +67,10 @@ def posterior_progress(study: Study, cohort: Cohort, progress: Progress, row: in
     """
     person, optima = cohort.rows(np.array([row])), progress.individual[progress.at(progress.moments), row]
     maps = {f"{count} trials": posterior.predict for count, posterior in progress.person(row).items()}
-    if study.space.dim == 1:
+    if len(study.space.free) == 1:
         return maps_beside(study, maps, optima)
-    third = float(optima[-1][2]) if study.space.dim > 2 else None
+    at = third_of(study)
+    third = None if at is None else float(optima[-1][at])
     grids = [grid_slice(study, predict, optima[-1], third) for predict in maps.values()]
     figure, panels, draw = map_panels(study, grids)
     counts = []
@@ -68,7 +78,7 @@ def posterior_progress(study: Study, cohort: Cohort, progress: Progress, row: in
         draw(axes, values)
         counts.append(mark_trials(axes, study, person.first(n), third))
         star(axes, study, x)
-        title(axes, name if third is None else f"{name}, {level_words(study, 2, third)}")
+        title(axes, third_words(study, third, f"{name}, ") or name)
     legend(figure, [*answer_handles(study, np.concatenate(counts)), *map_handles(study)])
     return figure
 
@@ -80,14 +90,15 @@ def sets_on_map(
     `UNKNOWN` times that without responses; and whether any part is hatched. Paper, figure 6a.
 
     `sets`: None shows the optimum `best` (d,) alone; `prior`: the map's variance without responses
-    (`RuleMap.map_prior`). With one parameter it is a curve, without hatching.
+    (`RuleMap.map_prior`). With one free parameter it is a curve, without hatching.
     """
     points: dict[str, Any] = {"best": best}
     if sets is not None:
         points = dict(zip(_MARKS, np.asarray(sets.x), strict=True))
-    if study.space.dim == 1:
+    if len(study.space.free) == 1:
         return _sets_on_curve(study, surface, points), False
-    thirds = {name: float(x[2]) for name, x in points.items()} if study.space.dim > 2 else {"best": None}
+    at = third_of(study)
+    thirds = {"best": None} if at is None else {name: float(x[at]) for name, x in points.items()}
     grids = [grid_slice(study, surface, best, third) for third in thirds.values()]
     figure, panels, draw = map_panels(study, grids)
     hatched, counts = False, []
@@ -97,7 +108,7 @@ def sets_on_map(
         counts.append(mark_trials(axes, study, cohort, third))
         for shown in points if third is None else [name]:
             _mark(axes, study, shown, points[shown])
-        title(axes, "" if third is None else f"{level_words(study, 2, third)} ({name})")
+        title(axes, "" if third is None else f"{third_words(study, third)} ({name})")
     handles: list[Any] = [
         Line2D([], [], linestyle="", marker=_MARKS[n][0], color=_MARKS[n][2], markeredgecolor="black", label=n)
         for n in points
@@ -124,7 +135,9 @@ def _mark(axes, study, name, x):
     """Mark a point `x` (d,) of the unit cube as the set `name` ("best", "mid" or "worst") on `axes`."""
     marker, size, colour = _MARKS[name]
     look = {"marker": marker, "s": size, "color": colour, "edgecolor": "black", "linewidth": 0.7}
-    axes.scatter(*np.asarray(study.space.to_physical(np.asarray(x)))[:2], zorder=5, clip_on=False, **look)
+    axes.scatter(
+        *np.asarray(study.space.to_physical(np.asarray(x)))[list(study.space.free[:2])], zorder=5, clip_on=False, **look
+    )
 
 
 @styled
@@ -137,6 +150,6 @@ def _sets_on_curve(study, surface, points):
         physical = np.asarray(study.space.to_physical(np.asarray(x)))
         height = float(surface(jnp.asarray(x)[None, :])[0][0])
         look = {"marker": marker, "s": size, "color": colour, "edgecolor": "black"}
-        axes.scatter(physical[0], height, label=name, zorder=3, **look)
+        axes.scatter(physical[study.space.free[0]], height, label=name, zorder=3, **look)
     axes.legend(frameon=False)
     return figure

@@ -172,9 +172,10 @@ def level_words(study: Study, index: int, unit_value: float) -> str:
     return f"{_name(parameter.name)} = {plain(words)} {plain(parameter.unit)}".strip()
 
 
-def star(axes, study: Study, x, pair: tuple[int, int] = (0, 1)) -> None:
-    """Draw a star at a point `x` (d,) of the unit cube on `axes` of the parameters `pair`, in physical units."""
-    point = np.asarray(study.space.to_physical(np.asarray(x)))[list(pair)]
+def star(axes, study: Study, x, pair: tuple[int, ...] | None = None) -> None:
+    """Draw a star at a point `x` (d,) of the unit cube on `axes` of the parameters `pair`, by default the first two
+    free ones, in physical units."""
+    point = np.asarray(study.space.to_physical(np.asarray(x)))[list(pair or study.space.free[:2])]
     axes.plot(*point, marker="*", markersize=12, color=RED, markeredgecolor="white", clip_on=False, zorder=5)
 
 

@@ -126,7 +126,7 @@ def unanswered(initial: Float[np.ndarray, "k d"], proposed: Points, excluded: Po
 def all_excluded(study: Study, excluded: Float[np.ndarray, "k d"]) -> Float[np.ndarray, " d"] | None:
     """For discrete spaces in which no rendering is at least `APART` from all `excluded` ones: the candidate farthest
     from them, or the first excluded one, with the fewest stops, if all are excluded. None otherwise. Physical units."""
-    if not len(excluded) or not all(study.space.discrete):
+    if not len(excluded) or not all(study.space.discrete[i] for i in study.space.free):
         return None
     candidates = study.space.candidates(_SPREAD, 0)
     nearest = _distances(study, candidates, excluded).min(axis=1)

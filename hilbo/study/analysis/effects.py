@@ -53,7 +53,7 @@ def _effect(study, surface, optimum, points, i) -> Effect:
     along, allowed = slice_through(study, jnp.asarray(optimum), parameter.name, jnp.asarray(axis))
     others = np.repeat(points[None], len(axis), axis=0)
     others[..., i] = axis[:, None]
-    rows = others.reshape(-1, study.space.dim)
+    rows = np.asarray(study.space.completed(others.reshape(-1, study.space.dim), (i,)))
     mean, variance = (np.asarray(m) for m in surface(jnp.concatenate([along, jnp.asarray(rows)])))
     usable = np.asarray(study.space.feasible(rows)).reshape(len(axis), -1)
     heights = np.where(usable, mean[len(axis) :].reshape(usable.shape), 0.0)

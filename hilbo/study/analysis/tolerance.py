@@ -68,7 +68,8 @@ def slice_through(
     study: Study, x: Float[Array, " d"], parameter: str, values: Float[Array, " m"]
 ) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:
     """Points (m, d): copies of x with the coordinate of `parameter` at `values` (unit scale), and whether each is
-    feasible (m,). Where needed, K1 is lowered to the passive boundary, except in slices along K1."""
+    feasible (m,). Where needed, K1 is lowered to the passive boundary, except in slices along K1. Another
+    parameter of an equality follows."""
     space = study.space
     index = space.names.index(parameter)
     points = jnp.broadcast_to(x, (values.shape[0], x.shape[0])).at[:, index].set(values)
@@ -76,6 +77,7 @@ def slice_through(
         K1 = space.names.index("K1")
         wall = space.from_box(points.at[:, K1].set(1.0))[:, K1]
         points = points.at[:, K1].set(jnp.minimum(points[:, K1], wall))
+    points = space.completed(points, (index,))
     return points, space.feasible(points)
 
 

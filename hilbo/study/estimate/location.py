@@ -140,7 +140,7 @@ def _constraints(study: Study, x: Float[np.ndarray, " d"]) -> list[str]:
     parameters, held = study.space.parameters, []
     low, high = (np.array([getattr(p, end) for p in parameters]) for end in ("low", "high"))
     shares = (np.asarray(study.space.to_physical(x)) - low) / (high - low)
-    for constraint in study.space.constraints:
+    for constraint in (c for c in study.space.constraints if not c.equality):
         for one in (dataclasses.replace(constraint, least=None), dataclasses.replace(constraint, most=None)):
             walls = rows_of(parameters, [one])
             if np.any(np.abs(walls.normals @ shares - walls.offsets) < _AT):

@@ -1,4 +1,4 @@
-"""Linear constraints as people write them on a command line: `a + 2*b <= 3`, `0 <= a - b <= 1`, `a >= 2 b`."""
+"""Linear constraints as people write them on a command line: `a + 2*b <= 3`, `0 <= a - b <= 1`, `a + b = 1`."""
 
 import json
 import re
@@ -10,21 +10,23 @@ from hilbo.search.box import Constraint
 __all__ = ["constraint_of"]
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_EXAMPLE = '"a + 2*b <= 3" or "0 <= a - b <= 1"'
+_EXAMPLE = '"a + 2*b <= 3", "0 <= a - b <= 1" or "a + b = 1"'
 
 
 def constraint_of(text: str, names: Sequence[str]) -> Constraint:
     """Parse a linear constraint on the parameters `names`, such as "a + 2*b <= 3".
 
-    Sums of weighted parameters and numbers, compared by <= or >= once, or twice with numbers at both ends. Raises
-    `InputError`.
+    Sums of weighted parameters and numbers, compared by <= or >= once, or twice with numbers at both ends, or by =.
+    Raises `InputError`.
     """
     by_length = sorted(names, key=len, reverse=True)  # of "a" and "a b" the longer one is meant
     known = "|".join(re.escape(name) for name in by_length)
-    sides = re.split("(<=|>=)", text)
+    sides = re.split("(<=|>=|=)", text)
     sums = [_sum(text, side, names, known) for side in sides[::2]]
     if len(sides) not in (3, 5) or len(set(sides[1::2])) > 1 or not any(weights for weights, _ in sums):
         raise _not_understood(text)
+    if sides[1] == "=":
+        return _equality(text, sums)
     low, *middle, high = sums if sides[1] == "<=" else sums[::-1]
     if middle:
         weights, number = middle[0]
@@ -35,6 +37,15 @@ def constraint_of(text: str, names: Sequence[str]) -> Constraint:
         return Constraint(tuple(high[0].items()), low[1] - high[1], None)
     both = {name: low[0].get(name, 0.0) - high[0].get(name, 0.0) for name in {**low[0], **high[0]}}
     return Constraint(tuple(both.items()), None, high[1] - low[1])
+
+
+def _equality(text: str, sums: list[tuple[dict[str, float], float]]) -> Constraint:
+    """The equality of two sides, each its weights and its number. Raises InputError for more than two sides."""
+    if len(sums) != 2:
+        raise _not_understood(text)
+    left, right = sums if sums[0][0] else sums[::-1]
+    both = {name: left[0].get(name, 0.0) - right[0].get(name, 0.0) for name in {**left[0], **right[0]}}
+    return Constraint(tuple(both.items()), right[1] - left[1], right[1] - left[1])
 
 
 def _sum(text: str, side: str, names: Sequence[str], known: str) -> tuple[dict[str, float], float]:

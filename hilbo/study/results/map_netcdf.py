@@ -1,7 +1,8 @@
 """map.nc: the population map on a grid or at points, written with a digest of its content and checked when read.
 
-A grid if there are at most three parameters, all continuous; otherwise points: feasible ones of low discrepancy, a
-fifth of them on walls, edges and corners, each with its values in physical units and the map's mean and variance there.
+A grid if there are at most three parameters, all continuous, and no equality; otherwise points: feasible ones of low
+discrepancy, a fifth of them on walls, edges and corners, each with its values in physical units and the map's mean and
+variance there.
 """
 
 import hashlib
@@ -33,8 +34,9 @@ _WIDEST = 10.0  # prior variances that a map's variance may be
 
 
 def on_grid(space: SearchSpace) -> bool:
-    """Whether maps of this space are stored on a grid (at most three parameters, all continuous), and not at points."""
-    return space.dim <= 3 and not any(space.discrete)
+    """Whether maps of this space are stored on a grid (at most three parameters, all continuous and free), and not at
+    points."""
+    return space.dim <= 3 and not any(space.discrete) and not space.dependent
 
 
 def map_dataset(study: Study, surface: Callable[..., Any], cells: int = CELLS) -> xr.Dataset:

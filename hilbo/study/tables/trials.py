@@ -30,6 +30,7 @@ from hilbo.study.formats.csv_file import (
     place,
     refuse,
 )
+from hilbo.study.tables.equalities import check_equalities
 from hilbo.study.tables.flag_counts import added, counted_flags, flagged
 from hilbo.study.tables.missing import Missing, missing_labels
 from hilbo.study.tables.remarks import note_absent, note_doubtful_ids
@@ -169,6 +170,7 @@ def _checked(text: pd.DataFrame, study: StudyFile, source: str, others: bool, te
     check_texts(text, source, numeric | {"response"})
     for parameter in study.space.parameters:
         table[parameter.name] = parameter_values(text, parameter, source)
+    check_equalities(table, text.index, study, source)
     table["_missing"] = missing_labels(text["response"], study.missing)
     given = _categories(text["response"][table["_missing"].isna()], study.responses, source)
     table["category"] = given.reindex(text.index, fill_value=_NONE)
