@@ -16,6 +16,7 @@ import pytest
 from commands import run
 from simulated import ENVIRONMENT, needs_device, own_cache  # noqa: F401
 
+from hilbo.cli.device import screen
 from hilbo.cli.device.screen import trace
 from hilbo.device import messages
 from hilbo.device.local.simulator import Simulator
@@ -328,14 +329,27 @@ def test_keys_from_a_terminal(device, sets):
 
     thread = threading.Thread(target=listen, daemon=True)
     thread.start()
-    for key, words in ((b"1", b"is active"), (b" ", b"RUNNING")):
-        _type_until(master, key, words, said)
-    os.write(master, b"q")
-    assert feels.wait(60) == 0
+    try:
+        for key, words in ((b"1", b"is active"), (b" ", b"RUNNING")):
+            _type_until(master, key, words, said)
+        os.write(master, b"q")
+        assert feels.wait(60) == 0
+    finally:
+        feels.kill()
     assert termios.tcgetattr(slave)[3] == before[3]
     os.close(slave)
     thread.join(5)
     os.close(master)
+
+
+def test_a_terminal_that_is_closed_ends_the_command():
+    """Else a device would move that no key can stop."""
+    pytest.importorskip("termios")
+    master, slave = os.openpty()
+    assert list(screen._waiting(slave)) == []
+    os.close(master)
+    assert list(screen._waiting(slave)) == ["q"]
+    os.close(slave)
 
 
 def _type_until(master, key, words, said):

@@ -252,13 +252,18 @@ def _keyboard() -> Iterator[Callable[[], Iterator[str]]]:
     try:
         yield lambda: _waiting(file)
     finally:
-        termios.tcsetattr(file, termios.TCSADRAIN, before)
+        with contextlib.suppress(termios.error):  # a terminal that was closed has no mode
+            termios.tcsetattr(file, termios.TCSADRAIN, before)
 
 
 def _waiting(file: int) -> Iterator[str]:
-    """The keys that were pressed in a terminal and not read yet."""
+    """The keys that were pressed in a terminal and not read yet; "q" if the terminal has been closed, so that no device
+    moves that nobody can stop."""
     while select.select([file], [], [], 0)[0]:
-        data = os.read(file, 1)
+        try:
+            data = os.read(file, 1)
+        except OSError:  # as Linux reports a terminal that was closed
+            data = b""
+        yield data.decode(errors="replace") or "q"
         if not data:
             return
-        yield data.decode(errors="replace")
