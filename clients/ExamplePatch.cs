@@ -4,7 +4,7 @@
 //     hilbo session colour.toml --participant P01 --dry-run      # in another terminal: prints the links
 //     mcs ExamplePatch.cs HilboStimulus.cs -out:ExamplePatch.exe && mono ExamplePatch.exe LINK-OF-THE-STIMULUS
 //
-// The reference is a patch of a colour that nobody is told.
+// The reference is a patch of a hidden colour.
 
 using System;
 using System.Collections.Generic;
@@ -41,7 +41,7 @@ static class ExamplePatch {
                 stimulus.Failed("this patch has hue and light");
             } else {
                 Draw("Test", order.Values);
-                stimulus.Presented(order.Values);  // what is really in force: here, what was asked for
+                stimulus.Presented(order.Values);  // the values really presented: here, the requested ones
             }
         }
     }

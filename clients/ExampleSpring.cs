@@ -6,7 +6,7 @@
 //
 // The loop stands for the one of your device: it reads a position (here of a finger that is simulated), and sets a force
 // (here none is set). What has to be the same in yours: goNeutral only replaces a value, the loop looks at it in each
-// tick, and contact is said as the loop sees it.
+// tick, and contact is reported as the loop detects it.
 
 using System;
 using System.Diagnostics;

@@ -1,7 +1,7 @@
 // Present the stimuli of a hilbo session from a C# program, for instance in Unity.
 //
 // hilbo does not guard your actuators, and certifies nothing about them. If your program moves something that people
-// touch, an independent hardware stop beside the hand is yours to provide.
+// touch, an independent hardware stop within reach of the hand must be provided by you.
 //
 // One file, for .NET Standard 2.0 or newer (Unity 2018.1 or newer), which needs nothing else: copy it into your project.
 //
@@ -10,7 +10,7 @@
 //         while (stimulus.Next(out order)) {
 //             if (order.What == "present") {
 //                 Show(order.Show, order.Values);  // "test" with values, "reference" without
-//                 stimulus.Presented();            // or Presented(values): what is really in force
+//                 stimulus.Presented();            // or Presented(values): the values really presented
 //             } else {
 //                 Blank();
 //                 stimulus.Neutral();
@@ -22,9 +22,9 @@
 // Neutral and Failed wait for the server's answer, some ms, and for silence_s where it does not come.
 //
 // A program that moves something gives force and goNeutral, a function that takes away all force. It is called by
-// threads of this file, one at a time: as soon as the server says so, when the connection fails, and at the latest 50 ms
-// after the server has been silent for the time that it states (SilenceS, 1 s unless the study says otherwise). Set
-// Contact while somebody touches what you move: no order to present is handed to you meanwhile. In Unity goNeutral must
+// threads of this file, one at a time: as soon as the server orders it, when the connection fails, and at the latest
+// 50 ms after the server has been silent for the time that it states (SilenceS, 1 s by default). Set
+// Contact while a hand touches what you move: no order to present is handed to you meanwhile. In Unity goNeutral must
 // not touch scene objects, which belong to the main thread. docs/guides/stimulus.md of hilbo has the protocol.
 
 using System;
@@ -37,7 +37,7 @@ using System.Threading;
 
 namespace Hilbo {
 
-/// <summary>The session does not let this program in, and says why.</summary>
+/// <summary>The session refuses this program, with the reason.</summary>
 public class StimulusException : Exception {
     public StimulusException(string why) : base(why) {}
 }
@@ -131,7 +131,7 @@ public sealed class Stimulus : IDisposable {
     /// <summary>The newest order, for programs that look at every frame.</summary>
     public Order Order { get { lock (_lock) return _order; } }
 
-    /// <summary>Whether somebody touches what moves.</summary>
+    /// <summary>Whether a hand touches the moving part.</summary>
     public bool Contact {
         get { lock (_lock) return _contact; }
         set { lock (_lock) { _contact = value; Monitor.PulseAll(_lock); } }
@@ -244,7 +244,7 @@ public sealed class Stimulus : IDisposable {
         lock (_lock) {
             order = _handed;
             if (order != _order) return false;     // it is over; the next one is there already
-            if (order.Number == 0) return true;    // nobody is there to be told
+            if (order.Number == 0) return true;    // there is no server to send it to
         }
         try {
             lock (_saying) if (!Report(_own, order, state, values, more)) return false;
@@ -380,7 +380,7 @@ public sealed class Stimulus : IDisposable {
         get { return (DateTime.UtcNow - new DateTime(1970, 1, 1, 0, 0, 0, DateTimeKind.Utc)).TotalSeconds; }
     }
 
-    // One connection to the server, made when it is needed, and made anew after a failure. Used by one thread at a time.
+    // One connection to the server, made when it is needed, and again after a failure. Used by one thread at a time.
     sealed class Line {
         readonly string _host;
         readonly int _port;

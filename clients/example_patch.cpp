@@ -4,7 +4,7 @@
 //     hilbo session colour.toml --participant P01 --dry-run      # in another terminal: prints the links
 //     g++ -std=c++11 -pthread example_patch.cpp -o example_patch && ./example_patch LINK-OF-THE-STIMULUS
 //
-// The reference is a patch of a colour that nobody is told.
+// The reference is a patch of a hidden colour.
 
 #include <cmath>
 #include <iostream>
@@ -51,7 +51,7 @@ int main(int count, char **words) {
         stimulus.failed("this patch has hue and light");
       } else {
         draw("Test", order.values);
-        stimulus.presented(order.values); // what is really in force: here, what was asked for
+        stimulus.presented(order.values); // the values really presented: here, the requested ones
       }
     }
   } catch (const hilbo::Error &error) {

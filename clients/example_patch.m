@@ -5,7 +5,7 @@ function example_patch(link)
 %   hilbo session colour.toml --participant P01 --dry-run          % in a terminal: prints the links
 %   example_patch('LINK-OF-THE-STIMULUS')                          % here; Ctrl-C ends
 %
-% In a figure's window, or, without a screen, in the terminal. The reference is a patch of a colour that nobody is told.
+% In a figure's window, or, without a screen, in the terminal. The reference is a patch of a hidden colour.
 
   reference = containers.Map({'hue', 'light'}, {205, 45});
   stimulus = hilbo_stimulus(link, 'example_patch.m', '1', 'neutral_within_s', 0.5);
@@ -26,7 +26,7 @@ function example_patch(link)
       stimulus.failed('this patch has hue and light');
     else
       draw('Test', colour(order.values));
-      stimulus.presented(order.values);  % what is really in force: here, what was asked for
+      stimulus.presented(order.values);  % the values really presented: here, the requested ones
     end
   end
 end

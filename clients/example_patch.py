@@ -4,7 +4,7 @@
     hilbo session colour.toml --participant P01 --dry-run      # in another terminal: prints the links
     python clients/example_patch.py LINK-OF-THE-STIMULUS
 
-The reference is a patch of a colour that nobody is told.
+The reference is a patch of a hidden colour.
 """
 
 import colorsys
@@ -41,7 +41,7 @@ def main(link):
                 stimulus.presented()
             else:
                 draw("Test", order.values)
-                stimulus.presented(order.values)  # what is really in force: here, what was asked for
+                stimulus.presented(order.values)  # the values really presented: here, the requested ones
 
 
 if __name__ == "__main__":

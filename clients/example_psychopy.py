@@ -4,7 +4,7 @@
     hilbo session grating.toml --participant P01 --dry-run
     python example_psychopy.py LINK-OF-THE-STIMULUS
 
-Needs PsychoPy, and hilbo_stimulus.py beside it. An order is confirmed after the flip that shows it. Escape ends.
+Needs PsychoPy, and hilbo_stimulus.py next to it. An order is confirmed after the flip that shows it. Escape ends.
 """
 
 import sys

@@ -29,7 +29,7 @@ REFERENCE = {"K1": 0.4, "B1": 0.4, "alpha": 0.3}
 
 
 class Rendering:
-    """The orders of a session, carried out by a renderer that is ticked by a thread of its own, started here."""
+    """The orders of a session, carried out by a renderer that is ticked by a separate thread, started here."""
 
     def __init__(self, renderer, motor):
         self.renderer, self.motor = renderer, motor
@@ -53,7 +53,7 @@ class Rendering:
     def run(self, stimulus):
         """Carry out the orders of `stimulus`; ends only by its exceptions.
 
-        If the device stops by itself during a trial, the session is told, which voids the trial.
+        If the device stops by itself during a trial, this is reported to the session, which voids the trial.
         """
         self.stimulus = stimulus
         while True:
@@ -68,7 +68,7 @@ class Rendering:
                 self.rest()
 
     def look(self):
-        """Send the heartbeat, tell the session about contact, and return the renderer's state.
+        """Send the heartbeat, report contact to the session, and return the renderer's state.
 
         To be called every few milliseconds, also while waiting.
         """

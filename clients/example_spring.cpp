@@ -6,7 +6,7 @@
 //
 // The loop at 1 kHz stands for yours: it reads a position (here of a finger that is simulated), and sets a force (here
 // none is set). What has to be the same in yours: go_neutral only sets an atomic number, the loop looks at it in each
-// tick, and contact is said as the loop sees it.
+// tick, and contact is reported as the loop detects it.
 
 #include <atomic>
 #include <cmath>
@@ -18,7 +18,7 @@
 static std::atomic<bool> ended(false);
 
 struct Spring {
-  std::atomic<double> stiffness, damping; // both 0: no force, whatever the position
+  std::atomic<double> stiffness, damping; // both 0: no force at any position
   Spring() : stiffness(0), damping(0) {}
   void set(double k, double b) {
     stiffness = k;

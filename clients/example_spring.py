@@ -6,7 +6,7 @@
 
 The loop stands for the one of your device: it reads a position (here of a finger that is simulated), and sets a force
 (here none is set). What has to be the same in yours: `go_neutral` works whatever the loop is doing, the loop looks in
-each tick at what is in force, and contact is said as the loop sees it.
+each tick at what is in force, and contact is reported as the loop detects it.
 """
 
 import math
@@ -24,7 +24,7 @@ def set_motor(force):
 
 
 class Spring:
-    """Stiffness (N/mm) and damping (N s/mm) as one tuple `set`; both 0: no force, whatever the position."""
+    """Stiffness (N/mm) and damping (N s/mm) as one tuple `set`; both 0: no force at any position."""
 
     def __init__(self):
         self.set, self.ended = NEUTRAL, False
@@ -53,7 +53,7 @@ class Spring:
 
 
 def main(link):
-    """Present orders until Ctrl-C, with the loop in a thread of its own."""
+    """Present orders until Ctrl-C, with the loop in a separate thread."""
     spring = Spring()
     said = {"force": True, "go_neutral": spring.neutral, "neutral_within_s": 0.05}
     with Stimulus(link, name="example_spring", version="1", **said) as stimulus:

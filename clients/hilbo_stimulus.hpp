@@ -1,9 +1,9 @@
 // Present the stimuli of a hilbo session from a C++ program.
 //
 // hilbo does not guard your actuators, and certifies nothing about them. If your program moves something that people
-// touch, an independent hardware stop beside the hand is yours to provide.
+// touch, an independent hardware stop within reach of the hand must be provided by you.
 //
-// One file, for C++11 or newer, which needs nothing but the standard library and the system's sockets; copy it beside
+// One file, for C++11 or newer, which needs nothing but the standard library and the system's sockets; copy it next to
 // your program. Link with -pthread, on Windows with ws2_32.
 //
 //     #include "hilbo_stimulus.hpp"
@@ -13,7 +13,7 @@
 //     while (stimulus.next(order)) {
 //       if (order.what == "present") {
 //         show(order.show, order.values);  // "test" with values, "reference" without
-//         stimulus.presented();            // or presented({{"hue", 211.0}}): what is really in force
+//         stimulus.presented();            // or presented({{"hue", 211.0}}): the values really presented
 //       } else {
 //         blank();
 //         stimulus.neutral();
@@ -21,9 +21,9 @@
 //     }
 //
 // A program that moves something sets Options::force and gives Options::go_neutral, a function that takes away all
-// force. It is called by threads of this file, one at a time: as soon as the server says so, when the connection fails,
-// and at the latest 50 ms after the server has been silent for the time that it states (silence_s(), 1 s unless the
-// study says otherwise). Call contact(true) while somebody touches what you move: no order to present is handed to you
+// force. It is called by threads of this file, one at a time: as soon as the server orders it, when the connection
+// fails, and at the latest 50 ms after the server has been silent for the time that it states (silence_s(), 1 s by
+// default). Call contact(true) while a hand touches what you move: no order to present is handed to you
 // until contact(false). docs/guides/stimulus.md of hilbo has the protocol.
 
 #ifndef HILBO_STIMULUS_HPP
@@ -67,7 +67,7 @@ typedef std::map<std::string, double> Values;        // parameter -> number, in 
 typedef std::map<std::string, std::string> Texts;    // the same as it is sent: of a level its name
 typedef std::vector<std::vector<std::string>> Lines; // an answer: lines of fields
 
-// The session does not let this program in, and says why.
+// The session refuses this program, with the reason.
 struct Error : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
@@ -183,7 +183,7 @@ const int send_flags = MSG_NOSIGNAL;
 const int send_flags = 0;
 #endif
 
-// One connection to the server, made when it is needed, and made anew after a failure. Used by one thread at a time.
+// One connection to the server, made when it is needed, and again after a failure. Used by one thread at a time.
 class Line {
 public:
   Line(std::string host, std::string port) : host_(std::move(host)), port_(std::move(port)) {}
@@ -343,7 +343,7 @@ public:
     return order_;
   }
 
-  // Whether somebody touches what moves.
+  // Whether a hand touches the moving part.
   void contact(bool yes) {
     std::lock_guard<std::mutex> lock(mutex_);
     contact_ = yes;
@@ -480,7 +480,7 @@ private:
     const Order order = handed_;
     if (handed_count_ != count_) return false; // it is over; the next one is there already
     now.unlock();
-    if (order.number == 0) return true; // nobody is there to be told
+    if (order.number == 0) return true; // there is no server to send it to
     try {
       std::lock_guard<std::mutex> lock(saying_);
       if (!report(own_, order, state, values, why.empty() ? "" : "&why=" + detail::escaped(why))) return false;

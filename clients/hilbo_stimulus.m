@@ -2,10 +2,10 @@ classdef hilbo_stimulus < handle
 % HILBO_STIMULUS  Present the stimuli of a hilbo session from MATLAB (R2020b or newer) or GNU Octave (7 or newer).
 %
 % hilbo does not guard your actuators, and certifies nothing about them. If your program moves something that people
-% touch, an independent hardware stop beside the hand is yours to provide.
+% touch, an independent hardware stop within reach of the hand must be provided by you.
 %
 % One file, which needs no toolbox, and in Octave the package instrument-control, for tcpclient, which MATLAB has: copy
-% it beside your program.
+% it next to your program.
 %
 %   stimulus = hilbo_stimulus(link, 'my scene', '1.0');
 %   while true
@@ -13,7 +13,7 @@ classdef hilbo_stimulus < handle
 %     if isempty(order), continue, end
 %     if strcmp(order.what, 'present')
 %       show(order.show, order.values);             % 'test' with values, a containers.Map; 'reference' without
-%       stimulus.presented();                       % or presented(values): what is really in force
+%       stimulus.presented();                       % or presented(values): the values really presented
 %     else
 %       blank();
 %       stimulus.neutral();
@@ -28,16 +28,16 @@ classdef hilbo_stimulus < handle
 %
 %   stimulus = hilbo_stimulus(link, 'my arm', '1', 'force', true, 'go_neutral', @limp, 'neutral_within_s', 0.1);
 %
-% limp is called within those four: as soon as the server says so, when the connection fails, and at the latest when the
-% server has not been heard for silence_s. It is not called while your own code runs: a motor that people touch belongs
-% on a controller of its own, with a watchdog. Set stimulus.contact = true while somebody touches it: no order to present
+% limp is called within those four: as soon as the server orders it, when the connection fails, and at the latest when
+% the server has not been heard for silence_s. It is not called while your own code runs: a motor that people touch belongs
+% on a controller of its own, with a watchdog. Set stimulus.contact = true while a hand touches it: no order to present
 % is handed to you until it is false. docs/guides/stimulus.md of hilbo has the protocol.
 %
 % An order is a struct: what ('present', 'neutral' or 'stop'), show ('test' or 'reference'), side ('a' or 'b' where two
 % tests are compared), values (containers.Map: parameter -> number in the study's unit, or the name of a level), trial, step, number, within_s.
 
   properties
-    contact = false;          % whether somebody touches what moves
+    contact = false;          % whether a hand touches the moving part
   end
   properties (SetAccess = private)
     parameters = struct('name', {}, 'unit', {}, 'low', {}, 'high', {}, 'tolerance', {}, 'levels', {});
@@ -189,7 +189,7 @@ classdef hilbo_stimulus < handle
     end
 
     function taken = say(s, state, fields)
-      % A report of the program's own; whether it was taken. Where the server was lost nobody is there to be told.
+      % A report of the program's own; whether it was taken. Where the server was lost there is no server to send it to.
       taken = s.order.number == 0;
       if isempty(s.run) || taken, return, end
       number = s.order.number;

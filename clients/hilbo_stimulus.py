@@ -1,9 +1,9 @@
 """Present the stimuli of a hilbo session from a program of your own.
 
 hilbo does not guard your actuators, and certifies nothing about them. If your program moves something that people
-touch, an independent hardware stop beside the hand is yours to provide.
+touch, an independent hardware stop within reach of the hand must be provided by you.
 
-One file, for Python 3.9 or newer, which needs nothing but the standard library: copy it beside your program.
+One file, for Python 3.9 or newer, which needs nothing but the standard library: copy it next to your program.
 
     from hilbo_stimulus import Stimulus
 
@@ -11,7 +11,7 @@ One file, for Python 3.9 or newer, which needs nothing but the standard library:
         for order in stimulus:
             if order.do == "present":
                 show(order.show, order.values)       # "test" with values, "reference" without
-                stimulus.presented()                 # or presented({"height": 540.0}): what is really in force
+                stimulus.presented()                 # or presented({"height": 540.0}): the values really presented
             else:
                 blank()
                 stimulus.neutral()
@@ -19,10 +19,10 @@ One file, for Python 3.9 or newer, which needs nothing but the standard library:
 With asyncio: `async for order in stimulus.orders()`, and `await asyncio.to_thread(stimulus.presented)`.
 
 A program that moves something says `force=True` and gives `go_neutral`, a function that takes away all force. It is
-called in a thread of this module, as soon as the server says so, or has been silent for the time that it states
-(`silence_s`, 1 s unless the study says otherwise), or its connection fails; so it may be called while your own loop is
-busy, and often. Say `stimulus.contact = True` while somebody touches it: no order to present is handed to you until
-that is over. docs/guides/stimulus.md of hilbo has the protocol.
+called in a thread of this module, as soon as the server orders it, or has been silent for the time that it states
+(`silence_s`, 1 s by default), or its connection fails; so it may be called while your own loop is busy, and often.
+Set `stimulus.contact = True` while a hand touches it: no order to present is handed to you until that is over.
+docs/guides/stimulus.md of hilbo has the protocol.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ _SILENCE = Order(0, "neutral")  # before a server has spoken, and after one is s
 
 
 class Stimulus:
-    """Connection of this program to a session, kept by two threads of its own until `close`.
+    """Connection of this program to a session, kept by two separate threads until `close`.
 
     `link`: the one that `hilbo session` prints for the stimulus, for one program at a time. `force`: the program moves
     something that people touch; it must then give `go_neutral`, a function that takes all force away and is called in a
@@ -127,7 +127,7 @@ class Stimulus:
 
     @property
     def contact(self) -> bool:
-        """Whether somebody touches what moves, set by your program.
+        """Whether a hand touches the moving part, set by your program.
 
         With `force`, orders to present are withheld by `next` meanwhile.
         """
@@ -281,7 +281,7 @@ class Stimulus:
         if order.number != self._order.number:
             return False  # it is over; the next one is there already
         if not order.number:
-            return True  # nobody is there to be told
+            return True  # there is no server to send it to
         try:
             taken = self._report(order, state, **more)
         except (OSError, http.client.HTTPException, ValueError) as error:

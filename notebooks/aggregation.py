@@ -1,7 +1,7 @@
 # %% [markdown]
-# # Which aggregation when
-# People who agree, and people who do not: the same rules aggregate both, and leaving one person out at a time says
-# which of them predicts a person's answers.
+# # Comparison of aggregation methods
+# Participants with similar and with different optima are aggregated by the same methods; leave-one-participant-out
+# cross-validation shows which method predicts the responses best.
 
 # %%
 import dataclasses
@@ -31,8 +31,8 @@ trials = int(os.environ.get("HILBO_NOTEBOOK_TRIALS", "10"))
 SHOWN = ["rule", "negative_log_density", "difference", "difference_error", "central_95", "z2", "optimum_sd"]
 
 # %% [markdown]
-# ## Simulated people whose optima scatter, more or less
-# The preset `paper` scatters people's optima by a quarter of the range of K1; `alike` hardly scatters them at all.
+# ## Simulated participants with different spreads of optima
+# In the preset `paper` the individual optima have a spread of a quarter of the range of K1; in `alike` almost none.
 
 # %%
 raw = tomllib.loads((DATA / "paper.toml").read_text())
@@ -48,8 +48,8 @@ for words, spread in (("alike", (0.02, 0.02, 0.02)), ("as in the preset", PRESET
     print(comparison_table(comparison)[SHOWN].round(3).to_string(index=False), "\n")
 
 # %% [markdown]
-# ## Real people: video quality
-# Six of the seventeen; all of them take a minute: `hilbo aggregate ... --compare`.
+# ## Real data: video quality
+# Six of the seventeen participants; all of them take a minute: `hilbo aggregate ... --compare`.
 
 # %%
 video = Study.load(DATA / "video_quality.toml")
@@ -59,7 +59,7 @@ print(comparison["recommendation"])
 print(comparison_table(comparison)[SHOWN].round(3).to_string(index=False))
 
 # %% [markdown]
-# How much worse than the best rule, with two standard errors of the paired difference: a bar that reaches 0 is a tie.
+# Loss against the best method, with two standard errors of the paired difference: a bar that reaches 0 is a tie.
 
 # %%
 rules_figure(comparison)

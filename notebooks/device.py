@@ -1,8 +1,8 @@
 # %% [markdown]
 # # A set on a device: send it, press it, look at force and position
-# The device is simulated here: the firmware's own code, with an actuator, an encoder and a finger, in a process beside
-# this one. Its time is ours ("lockstep"): it passes while we wait for telemetry, as fast as it can. With a real device,
-# put its port in place of "sim", and leave the options out.
+# The device is simulated here: the firmware's code, with an actuator, an encoder and a finger, in a separate
+# process. Its time is that of this notebook ("lockstep"): it passes while the notebook waits for telemetry. With a real
+# device, put its port in place of "sim", and leave the options out.
 
 # %%
 import jax
@@ -27,8 +27,8 @@ print(f"stroke {said.position_low_mm:.1f} to {said.position_high_mm:.1f} mm in s
 
 # %% [markdown]
 # ## Send a set
-# The paper's aggregate parameters. The device checks them again with its own damping; what comes back is what it has in
-# force, bit for bit what was sent.
+# The paper's aggregate parameters. The device checks them again with its own damping; the returned values are those of
+# the active set, bit for bit those that were sent.
 
 # %%
 confirmed = device.send(K0=-3.18, K1=5.58, B1=7.88, alpha=0.176)
@@ -36,7 +36,7 @@ print(confirmed)
 print(f"needs {confirmed.needs:.4f} N.s/m of damping, has {said.damping_N_s_per_m:.4f}")
 
 # %% [markdown]
-# A set that is not passive on this device is refused, and the one in force stays.
+# A set that is not passive on this device is rejected, and the active one stays.
 
 # %%
 try:
@@ -47,7 +47,7 @@ print("in force:", device.in_force() == confirmed)
 
 # %% [markdown]
 # ## Press
-# A simulated finger presses in and swings at 2 Hz. On a real device this is your own.
+# A simulated finger presses in and oscillates at 2 Hz. On a real device, use your finger.
 
 # %%
 seconds = 3.0 if "HILBO_NOTEBOOK_TRIALS" in os.environ else 10.0
@@ -59,7 +59,7 @@ print("marks:", [flag.name for flag in SampleFlag if np.any(table["flags"] & int
 
 # %% [markdown]
 # ## Change the set while the finger is there
-# The new set warms a history of its own first, then takes over; the difference fades out under the slew limit.
+# The new set first fills its history, then takes over; the difference fades out under the slew limit.
 
 # %%
 device.send(K0=-2.89, K1=5.70, B1=5.89, alpha=0.203)
@@ -69,8 +69,8 @@ print(f"largest step of force {steps.max():.3f} N, slew limit {said.slew_limit_N
 
 # %% [markdown]
 # ## Stop
-# A real device gets its heartbeats from a process beside this one, so that whatever comes next may take its time; it
-# lets go when this one ends or hangs. Nobody feels anything any more here, and so it is stopped.
+# A real device gets its heartbeats from a separate process, so that computations of any length do not stop it; the
+# force ends when the notebook ends or hangs. The presentation is over, therefore the device is stopped.
 
 # %%
 device.stop()

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # From a creep and relaxation table to a passive search space
 # Sixteen relaxation tests (a position is applied) and sixteen creep tests (a force is applied) of a soft foam, as a
-# logger wrote them. They are simulated, so that the truth is known: K0 = -2.89, K1 = 5.70, B1 = 5.89, alpha = 0.203.
+# logger wrote them. They are simulated, with known parameters: K0 = -2.89, K1 = 5.70, B1 = 5.89, alpha = 0.203.
 
 # %%
 import jax
@@ -31,8 +31,8 @@ for test in material.tests:
 
 # %% [markdown]
 # ## Fit
-# One parameter set for both tests, in the memory that will be rendered: N = 101 samples of 1 ms. The recorded input
-# goes through the model, so that the ramp of the test is no problem.
+# One parameter set for both tests, with the memory of the rendering: N = 101 samples of 1 ms. The recorded input
+# goes through the model, so that the ramp of the test is taken into account.
 
 # %%
 fitted = fit(material.tests, Sampled(N=101, T=1e-3))
@@ -40,9 +40,9 @@ print({name: round(value, 4) for name, value in fitted.parameters().items()})
 print("NRMSE", {kind: f"{100 * value:.2f} %" for kind, value in nrmse(fitted).items()})
 
 # %% [markdown]
-# ## What the digits are worth
+# ## Precision
 # Profile intervals, corrected for autocorrelated residuals, and a bootstrap over the repeats. K_inst and K_eff are well
-# known; K0, K1 and B1 hang together and are known much less well, although the curve is.
+# determined; K0, K1 and B1 are correlated and much less precise, although the curve is precise.
 
 # %%
 result = characterise(material.tests, Sampled(N=101))
@@ -50,14 +50,14 @@ for name, estimate in result.estimates.items():
     print(f"{name:7s} {estimate.value:8.4f}  {estimate.lower:8.4f} to {estimate.upper:8.4f}  {estimate.status}")
 
 # %% [markdown]
-# The tests, the fit, and what is left of them.
+# The tests, the fit, and the residuals.
 
 # %%
 curves_figure(material.tests, result)
 
 # %% [markdown]
-# ## How much memory
-# The same tests fitted with other memories: parameters belong to their N.
+# ## Length of the memory
+# The same tests fitted with other memories: parameters depend on N.
 
 # %%
 if "HILBO_NOTEBOOK_TRIALS" not in os.environ:  # the tests of the notebooks skip the slow part
@@ -68,9 +68,9 @@ if "HILBO_NOTEBOOK_TRIALS" not in os.environ:  # the tests of the notebooks skip
         print(row.N or "full", {kind: f"{100 * e:.2f} %" for kind, e in row.nrmse.items()}, values)
 
 # %% [markdown]
-# ## A search space for people
-# The [renderer] block goes into a study file; what K1, B1 and alpha people are asked about is then the passive part of
-# the box on a device with this damping, with the material's own effective stiffness.
+# ## Search space of a study
+# The [renderer] block goes into a study file; the search space of K1, B1 and alpha is then the passive part of
+# the box on a device with this damping, with the effective stiffness of the material.
 
 # %%
 block = renderer_block(result, damping=0.95)

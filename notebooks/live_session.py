@@ -1,7 +1,7 @@
 # %% [markdown]
-# # A dry run: a session with nobody in it
-# A simulated participant feels a simulated device through the same code that serves the pages of `hilbo session`: the
-# log on disk, the fold of its events, the choosing ahead. Only the browser is left out; `hilbo simulate --live` has it.
+# # A dry run: a session without a participant
+# A simulated participant uses a simulated device through the same code as the pages of `hilbo session`: the
+# log on disk, the event-sourced state, the look-ahead. Only the browser is left out; `hilbo simulate --live` has it.
 
 # %%
 import jax
@@ -76,14 +76,14 @@ while log.state.screen not in ("done", "ended"):
 device.close()
 
 # %% [markdown]
-# ## What a participant would have seen, and nothing more
+# ## The participant's view
 
 # %%
 print(participant_view(log.state)["message"])
 
 # %% [markdown]
-# ## The log is the session
-# Replayed, it gives the same state; and the fits that somebody would have had to wait for are none.
+# ## Replaying the log
+# The replayed log gives the same state. No fit delayed a trial.
 
 # %%
 log.close()
@@ -93,7 +93,7 @@ print("looked up:", chooser.looked_up, "computed while somebody felt:", chooser.
 
 # %% [markdown]
 # ## This participant's map
-# The answers of the log's folder as a table, and the map that they make; the star is its optimum.
+# The responses of the log's folder as a table, and the resulting map; the star is its optimum.
 
 # %%
 cohort = cohort_of(read_log_trials(folder, study.file), study)

@@ -1,6 +1,6 @@
 # %% [markdown]
 # # Quick start
-# One participant, from answers to a posterior, and a session that asks and is told.
+# One participant, from responses to a posterior, and a session in ask-and-tell form.
 
 # %%
 import os
@@ -21,7 +21,7 @@ DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipp
 
 # %% [markdown]
 # ## A posterior
-# Points live in the unit cube; answers are categories, 0 = "different", 1 = "similar", 2 = "close".
+# Points are in the unit cube; responses are categories, 0 = "different", 1 = "similar", 2 = "close".
 
 # %%
 gp = OrdinalGP(kernel=RBF(theta=30.0), likelihood=OrdinalProbit(thresholds=(-0.5, 0.5), noise=0.5))
@@ -32,7 +32,7 @@ print("mean", mean, "sd", jnp.sqrt(variance))
 print("probabilities of different, similar, close:", posterior.class_probabilities(jnp.array([[0.5, 0.6]]))[0])
 
 # %% [markdown]
-# What this person would answer, from one corner of the space to the other.
+# Predicted responses of this participant, from one corner of the space to the other.
 
 # %%
 line = jnp.linspace(0.0, 1.0, 101)
@@ -44,7 +44,7 @@ plt.legend()
 plt.show()
 
 # %% [markdown]
-# Every fit certifies itself: the residual bounds the distance to the exact mode in prior standard deviations.
+# Convergence diagnostics of the fit: the residual bounds the distance to the exact mode in prior standard deviations.
 
 # %%
 print(posterior.certificate)
@@ -63,7 +63,7 @@ print(jax.grad(log_evidence, (0, 1))(30.0, 0.5))
 
 # %% [markdown]
 # ## A session
-# The study file says what is asked; each answer gives the next state, and the next point is inside the passive set.
+# The study file specifies the session; each response gives the next state. The next point is inside the passive set.
 
 # %%
 session = Session.start(Study.load(DATA / "paper.toml"), seed=1)

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Re-aggregating a data set
-# Seventeen people rated compressed video clips from bad to excellent. Their answers become one population map over
-# bitrate and height; any subset of people and any prefix of trials can be aggregated again. Put your own study file and
-# table in the place of these two.
+# Seventeen participants rated compressed video clips from bad to excellent. Their responses are aggregated into one
+# population map over bitrate and height; any subset of participants and any prefix of trials can be aggregated again.
+# Replace the study file and the table by your own.
 
 # %%
 from pathlib import Path
@@ -43,8 +43,8 @@ print(
 map_slices(study, aggregate.surface, aggregate.optimum.x, cohort)
 
 # %% [markdown]
-# ## Half the people, or a third of the trials
-# The map is a sum of what each person adds, so that leaving people out is cheap.
+# ## Half the participants, or a third of the trials
+# The map is a sum of individual contributions, so that leaving participants out is cheap.
 
 # %%
 candidates = jnp.asarray(study.space.candidates(2048, 0))
@@ -53,8 +53,8 @@ for words, part in (("first eight people", cohort.of(cohort.names[:8])), ("first
     print(words, np.asarray(study.space.to_physical(optimum.x)), "sd", float(optimum.sd))
 
 # %% [markdown]
-# More people make the map more certain everywhere, if they are noisy views of one function: the committee machine's
-# assumption.
+# The precision of the map increases with the number of participants everywhere, if they are noisy views of one
+# function, as the committee machine assumes.
 
 # %%
 points = candidates[:5]

@@ -1,8 +1,8 @@
 # %% [markdown]
-# # Real people
-# Two published data sets of ordinal answers: seventeen people who rated compressed video clips (shipped), and eight
-# people who judged orientations in eight graded categories (not shipped: used if `orientation_confidence.csv` lies
-# here). How consistent are they, do they lapse, do they drift, and does one map do for all?
+# # Real data
+# Two published data sets of ordinal responses: seventeen participants who rated compressed video clips (shipped), and
+# eight who judged orientations in eight graded categories (not shipped: used if `orientation_confidence.csv` is
+# here). The notebook estimates consistency, lapses and drift, and compares one map for all with individual optima.
 
 # %%
 import os
@@ -29,8 +29,8 @@ DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipp
 
 # %% [markdown]
 # ## Video quality
-# Answers to clips of nearly the same bitrate and height are paired: another content of the same compression is what
-# these people were shown twice, so that the agreement is that of the rating, content and all.
+# Responses to clips of nearly the same bitrate and height are paired. The clips of a pair have the same compression and
+# different content, so that the agreement includes the effect of the content.
 
 # %%
 study = Study.load(DATA / "video_quality.toml")
@@ -43,14 +43,14 @@ print("left out by 'lapse_low > 0.3':", excluded(measured, "lapse_low > 0.3") or
 people_figure(measured, left_out=excluded(measured, "lapse_low > 0.3"))
 
 # %% [markdown]
-# People's drift: how many intervals leave 0 out, where one in twenty would by chance.
+# Drift: number of 95 % intervals without 0; one in twenty is expected by chance.
 
 # %%
 drifted = (measured["drift_low"] > 0) | (measured["drift_high"] < 0)
 print(int(drifted.sum()), "of", len(measured), "participants drifted; mean", round(measured["drift"].mean(), 2))
 
 # %% [markdown]
-# One map for all, and everybody's own optimum beside its own.
+# One map for all, and the individual optima.
 
 # %%
 aggregate = aggregate_cohort(study, cohort)
@@ -62,7 +62,7 @@ print("population optimum", best, "; individual optima away from it, median NRMS
 
 # %% [markdown]
 # ## Orientation and confidence
-# Eight categories, orientation and contrast. A hundred of each person's answers show how people differ.
+# Eight categories, orientation and contrast, with a hundred responses of each participant.
 
 # %%
 path = Path("orientation_confidence.csv")

@@ -1,7 +1,7 @@
 # %% [markdown]
-# # The paper's study, re-enacted
-# Simulated people feel three materials, answer "different", "similar" or "close", and are asked again in validation
-# sessions; one folder then holds what a laboratory would have, and `hilbo report` writes the results section.
+# # The paper's study, simulated
+# Simulated participants compare three materials, respond "different", "similar" or "close", and take part in validation
+# sessions; the files of such a study are in one folder, from which `hilbo report` writes the results section.
 
 # %%
 import dataclasses
@@ -37,8 +37,8 @@ participants, trials = 6, int(os.environ.get("HILBO_NOTEBOOK_TRIALS", "25"))
 
 # %% [markdown]
 # ## Three materials
-# They share the study file; each has its own set around which people's optima lie. (Where materials differ in their
-# effective stiffness, `[materials.NAME.renderer]` says so.)
+# They share the study file; each has its own set as the centre of the individual optima. (A different effective
+# stiffness of a material is specified in `[materials.NAME.renderer]`.)
 
 # %%
 MATERIALS = {
@@ -52,7 +52,7 @@ study = Study.load(folder / "study.toml")
 
 # %% [markdown]
 # ## Sessions
-# Everybody's trials are chosen by the session's own rule. The simulated people are those of docs/methods/simulation.md.
+# Trials are selected as in a real session. The simulated participants are described in docs/methods/simulation.md.
 
 # %%
 answers, truths, sets, compared = [], [], [], []

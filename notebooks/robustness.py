@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Robustness to the hyperparameters
-# How far does the population optimum move when the hyperparameters are optimised in place of those of the study file?
-# The same as `hilbo robustness`, with ratings of compressed video by real people. Put your own study file and table in
-# the place of these two.
+# Shift of the population optimum when the hyperparameters are optimised in place of those of the study file.
+# The same as `hilbo robustness`, with real ratings of compressed video. Replace the study file and the table by your
+# own.
 
 # %%
 import os
@@ -30,7 +30,7 @@ check = robustness(study, cohort)
 
 # %% [markdown]
 # ## Both optima
-# For the committee the criterion is the evidence of each participant's answers given those of all others.
+# For the committee the criterion is the evidence of each participant's responses given those of all others.
 
 # %%
 for name, place in (("study file", check.fixed), ("optimised", check.optimised)):
@@ -39,8 +39,8 @@ for name, place in (("study file", check.fixed), ("optimised", check.optimised))
 print(f"The optimum moves by {100 * check.nrmse:.1f} % of the search ranges (NRMSE).")
 
 # %% [markdown]
-# ## Is that far?
-# Compare the move with the sampling error: the optimum of resamples of the participants, with the hyperparameters of
+# ## Comparison with the sampling error
+# Compare the shift with the sampling error: the optimum of resamples of the participants, with the hyperparameters of
 # the study file.
 
 # %%
