@@ -98,7 +98,7 @@ def test_the_experimenter_is_told_what_went_wrong_without_a_value(tmp_path):
         preparer = Preparer(live.place.link("preparer"))
         live.begin()
         order = preparer.asked(live)
-        with refused(409, "it may be off by 0.5 deg"):
+        with refused(409, "the tolerance is 0.5 deg"):
             preparer.report("presented", values=order["values"] | {"hue": order["values"]["hue"] + 9})
         seen = live.until(lambda v: any(row["kind"] == "voided" for row in v["table"]["rows"]), live.whole)
         told = json.dumps(seen)

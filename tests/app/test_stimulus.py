@@ -292,7 +292,7 @@ def test_a_program_that_does_not_go_neutral_when_told_is_lost(tmp_path):
         live.until(lambda v: v["device"]["state"] == "running", live.whole)
         live.command("pause")
         live.until(lambda v: "has not confirmed neutral" in v["device"]["words"], live.whole)
-        with refused(409, "say hello"):
+        with refused(409, "send hello"):
             program.report("presented", order=order["order"])
 
 

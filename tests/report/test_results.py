@@ -197,7 +197,7 @@ def test_a_failed_certificate_is_said_in_one_sentence():
     content = results.result(study, failed, 0)
     assert content["warnings"] == [
         "The fit of P1 did not reach its tolerance, so that the results may be off by more than rounding;"
-        " see the certificates in result.json."
+        " see the certificate of each fit in result.json."
     ]
     from hilbo.report.page import results_page
     from hilbo.report.participants import people_of
@@ -205,7 +205,7 @@ def test_a_failed_certificate_is_said_in_one_sentence():
     page = results_page(study, content, {}, people_of(study, failed))
     assert content["warnings"][0] in page and "committee" in page
     other = results_page(study, content | {"rule": "hierarchical"}, {}, people_of(study, failed))
-    assert "committee" not in other and "by the rule <code>hierarchical</code>" in other
+    assert "committee" not in other and "by the method <code>hierarchical</code>" in other
 
 
 def test_many_participants_are_written_as_few():

@@ -210,7 +210,7 @@ def test_a_new_study_has_levels():
 
 
 def test_a_confirmed_level_is_not_nearly_another():
-    with pytest.raises(InputError, match=r"stimulus\.tolerance\.texture is of levels, and another level is none"):
+    with pytest.raises(InputError, match=r"stimulus\.tolerance\.texture is of levels, which have no tolerance"):
         surfaces(stimulus={"tolerance": {"texture": 1.0}})
     assert surfaces(stimulus={}).file.stimulus.off_by(surfaces().space.parameters[1], 1.0) == 0
 
