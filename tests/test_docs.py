@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
+import hilbo
 from hilbo.study.file import schema
 from hilbo.study.file.columns import UNWRITTEN
 from hilbo.study.file.protocols import PhaseTable
@@ -97,6 +98,17 @@ def test_modules_of_the_reference_and_names_of_pages_in_the_code_are_there():
             for name in re.findall(r"\bdocs/[\w/-]+\.(?:md|svg)", file.read_text(encoding="utf-8")):
                 missing += [] if (ROOT / name).is_file() else [f"{file.relative_to(ROOT)}: {name}"]
     assert missing == []
+
+
+def test_the_reference_begins_with_the_public_objects_and_repeats_none():
+    made = script("api_pages")
+    page = made.objects()
+    for name in hilbo.__all__:
+        assert f"[`hilbo.{name}`][{getattr(hilbo, name).__module__}.{name}]" in page
+    shown = re.findall(r"members: \[(.*)\]", "".join(made.reference(*entry) for entry in made.API.values()))
+    names = [name for members in shown for name in members.split(", ")]
+    classes = [name for name in hilbo.__all__ if name[0].isupper()]
+    assert [names.count(name) for name in classes] == [1] * len(classes)
 
 
 def test_tables_of_benchmarks_have_their_marks():

@@ -10,53 +10,13 @@ import posixpath
 import re
 from pathlib import Path
 
+from api_pages import API, objects, reference
 from formulas import rendered
 
 ROOT = Path(__file__).parents[2]
 FENCE = "```"
 EXECUTED = ROOT / "build" / "notebooks"  # what `make notebooks` makes; where it was not made, pages show the code alone
 
-# A page of the API reference: its title, and the modules in the order of reading.
-API = {
-    "model": ("The model", "ordinal_gp trials kernels likelihoods acquisition numerics.climbing errors"),
-    "inference": ("Inference and hyperparameters", "laplace gaussian inference.exact hyperparameters.maximum_evidence"),
-    "aggregation": (
-        "Aggregation",
-        "bcm study.cohort study.estimate.aggregate study.estimate.optimum study.analysis.best_mid_worst"
-        " study.analysis.tolerance study.analysis.rule_comparison population.pointwise population.shared.hierarchical"
-        " population.learnt.rule population.judged.response_quality",
-    ),
-    "mechanics": (
-        "Mechanics and search space",
-        "viscoelastic mechanics.fosls mechanics.memory mechanics.materials mechanics.continuous mechanics.switching"
-        " passivity mechanics.passivity_certificate mechanics.delay search.space search.columns search.candidates",
-    ),
-    "identification": (
-        "Identification",
-        "identification.material_tables identification.sampled identification.fitting identification.intervals"
-        " identification.residual_noise identification.instrument identification.misfit"
-        " identification.motor.friction_laws identification.moduli identification.characterise report.material",
-    ),
-    "sessions": (
-        "Studies and sessions",
-        "study.config session.choose.ask_tell session.choose.logged_session session.log.header session.plan.plan"
-        " session.log.actions session.log.state session.log.event_log session.choose.look_ahead"
-        " app.pages.session_views session.choose.warm_start",
-    ),
-    "simulation": (
-        "Simulation",
-        "simulation.presets simulation.simulate simulation.validation_sessions simulation.power",
-    ),
-    "reports": (
-        "Tables, statistics, reports",
-        "study.tables.trials study.folder study.tables.validation statistics.paper_tables statistics.logits"
-        " statistics.preferences report.study.comparison report.study.report report.study.result_tables",
-    ),
-    "device": (
-        "Device",
-        "hardware_bridge device.protocol device.ports device.local.simulator device.local.library device.local.motor",
-    ),
-}
 ELSEWHERE = {
     "README.md": "readme.md",
     "firmware/PROTOCOL.md": "device/protocol.md",
@@ -73,6 +33,7 @@ def generated() -> dict[str, str]:
     text = {page: (ROOT / file).read_text(encoding="utf-8") for file, page in ELSEWHERE.items()}
     text["changelog.md"] = UNSEARCHED + text["changelog.md"]
     text |= {page: notebook(ROOT / file) for file, page in NOTEBOOKS.items()}
+    text["api/objects.md"] = objects()
     return text | {f"api/{name}.md": reference(*entry) for name, entry in API.items()}
 
 
@@ -106,11 +67,6 @@ def _output(output: dict) -> str:
         return f'<img alt="Figure of the cell above" src="data:image/png;base64,{"".join(data["image/png"]).strip()}">'
     text = "".join(output.get("text", data.get("text/plain", "")))  # Jupyter writes lines as lists
     return f"{FENCE}text\n{text.rstrip()}\n{FENCE}" if output.get("name") != "stderr" and text.strip() else ""
-
-
-def reference(title: str, modules: str) -> str:
-    """A page of the API reference."""
-    return f"# {title}\n\n" + "\n\n".join(f"::: hilbo.{module}" for module in modules.split()) + "\n"
 
 
 def site_link(file: str, target: str) -> str | None:
