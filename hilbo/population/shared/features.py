@@ -32,6 +32,7 @@ __all__ = [
 TOLERANCE = 1e-6
 """Largest part of the prior variance of g that the features may leave at an answered point."""
 _ROOMS = (64, 256, 1024)  # of the programs that choose pivots
+_GROWING = (128, 256, 512)  # rows for which there is room at first in such a program
 _BLOCK, _DISTINCT = 64, 64  # of the sizes of records of all points; eps times it is left of a point that adds nothing
 _RANKS = (32, 64, 128, 256, 640, 1024)  # 640: all points of 24 people with 25 answers
 
@@ -81,10 +82,6 @@ def _chosen(
     """
     largest = room if most is None else jnp.minimum(room, most)
 
-    def going(state):
-        count, _, left, _ = state
-        return (count < largest) & (jnp.max(left) > tolerance)
-
     def choose(state):
         count, rows, left, chosen = state
         place = jnp.argmax(left)
@@ -92,8 +89,13 @@ def _chosen(
         row = (column - rows[:, place] @ rows) / jnp.sqrt(left[place])
         return count + 1, rows.at[count].set(row), (left - row**2).at[place].set(0.0), chosen.at[count].set(place)
 
-    initial = (jnp.asarray(0), jnp.zeros((room, x.shape[0]), x.dtype), asked.astype(x.dtype), jnp.full(room, -1))
-    _, _, left, chosen = jax.lax.while_loop(going, choose, initial)
+    state = (jnp.asarray(0), jnp.zeros((0, x.shape[0]), x.dtype), asked.astype(x.dtype), jnp.full(room, -1))
+    for size in (*(size for size in _GROWING if size < room), room):  # a step costs as much as there is room for rows
+        count, rows, *others = state
+        state = (count, jnp.pad(rows, ((0, size - len(rows)), (0, 0))), *others)
+        limit = jnp.minimum(size, largest)
+        state = jax.lax.while_loop(lambda s, limit=limit: (s[0] < limit) & (jnp.max(s[2]) > tolerance), choose, state)
+    _, _, left, chosen = state
     return chosen, jnp.max(left)
 
 
