@@ -9,6 +9,7 @@ from live import STUDY
 
 from hilbo.errors import InputError
 from hilbo.session.choose.warm_start import read_warm_start
+from hilbo.study.results import map_netcdf
 from hilbo.study.results.map_netcdf import map_dataset
 
 
@@ -18,6 +19,15 @@ def grid():
         return x.sum(axis=1) - 1.0, 0.1 + 0.2 * x[:, 0]
 
     return map_dataset(STUDY, surface, 5).assign_attrs(rule="bcm")
+
+
+def test_the_grid_is_predicted_in_blocks_of_one_size(monkeypatch):
+    whole, sizes = grid(), []
+    monkeypatch.setattr(map_netcdf, "_BLOCK", 4)
+    blocks = map_dataset(STUDY, lambda x: sizes.append(len(x)) or (x.sum(axis=1) - 1.0, 0.1 + 0.2 * x[:, 0]), 5)
+    assert set(sizes) == {4} and len(sizes) == -(-whole["mean"].size // 4)
+    for name in ("mean", "variance"):
+        np.testing.assert_array_equal(blocks[name], whole[name])
 
 
 def write(path, dataset):

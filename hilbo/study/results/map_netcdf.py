@@ -16,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import Float
 
 from hilbo.errors import InputError
 from hilbo.search.box import Parameter
@@ -28,6 +29,7 @@ __all__ = ["CELLS", "map_dataset", "on_grid", "read_map", "write_map"]
 CELLS = 41
 """Points of the map's grid along each parameter."""
 
+_BLOCK = 4096  # points that are predicted at a time
 _LARGEST = 10_000_000  # numbers in a variable: a damaged size is not to ask for all the memory
 _FARTHEST = 100.0  # prior standard deviations from 0 that a map's mean may be
 _WIDEST = 10.0  # prior variances that a map's variance may be
@@ -51,7 +53,7 @@ def map_dataset(study: Study, surface: Callable[..., Any], cells: int = CELLS) -
     side = np.linspace(0.0, 1.0, cells)
     x = np.stack(np.meshgrid(*(side,) * len(shown), indexing="ij"), axis=-1)
     flat = x.reshape(-1, len(parameters))
-    mean, variance = surface(flat)
+    mean, variance = _in_blocks(surface, flat)
     names = [p.name for p in shown]
     shape = x.shape[:-1]
     return xr.Dataset(
@@ -71,6 +73,17 @@ def map_dataset(study: Study, surface: Callable[..., Any], cells: int = CELLS) -
         coords={p.name: (p.name, p.to_physical(side), {"units": p.unit}) for p in shown},
         attrs={"study": study.file.hash},
     )
+
+
+def _in_blocks(
+    surface: Callable[..., Any], x: Float[np.ndarray, "m d"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Mean and variance (m,) of a map at many points, from blocks of one size: covariances with all points at once
+    would take hundreds of megabytes. The last block is filled up with copies of the last point."""
+    size = min(_BLOCK, len(x))
+    blocks = np.pad(x, ((0, -len(x) % size), (0, 0)), mode="edge").reshape(-1, size, x.shape[1])
+    means, variances = zip(*([np.asarray(moment) for moment in surface(block)] for block in blocks), strict=True)
+    return np.concatenate(means)[: len(x)], np.concatenate(variances)[: len(x)]
 
 
 def _map_at_points(study: Study, surface: Callable[..., Any], seed: int = 0) -> xr.Dataset:
