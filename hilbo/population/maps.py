@@ -278,7 +278,13 @@ def _shared_function(
         return shared_function(model, answers, answers.blank, every_point(model.unit, answers)).function
     if inference == "exact" or mask.sum() > largest:
         return None
-    return shared_posterior(fit_people(gp, of_people(trials), share, inference=inference, throw=False))
+    return _shared_of_people(gp, of_people(trials), share, inference)
+
+
+@program
+def _shared_of_people(gp: OrdinalGP, people: Trials, share: Float[Array, ""], inference: str) -> Posterior:
+    """Posterior of the shared function from the trials of `of_people`, converged or not."""
+    return shared_posterior(fit_people(gp, people, share, inference=inference, throw=False))
 
 
 def _pooled(gp: OrdinalGP, trials: Trials, inference: str, largest: int) -> Posterior | None:

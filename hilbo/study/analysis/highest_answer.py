@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from hilbo.likelihoods import Goal, OrdinalProbit
 from hilbo.population.learnt.rule import DrawnMap
@@ -19,7 +19,7 @@ from hilbo.study.config import Study
 
 __all__ = ["HighestAnswer", "highest_answer", "with_interval"]
 
-_QUANTILES = norm.ppf((np.arange(1000) + 0.5) / 1000)  # of the shared function at the stimulus, in each draw
+_QUANTILES = ndtri((np.arange(1000) + 0.5) / 1000)  # of the shared function at the stimulus, in each draw
 
 
 class HighestAnswer(NamedTuple):
