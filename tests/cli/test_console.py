@@ -15,10 +15,14 @@ def test_work_that_goes_by_people_says_how_many_and_how_long():
     pace = _Pace()
     assert pace.line("reading", None, None, 0.0) == ("reading", True)
     assert pace.line("people fitted", 100, 1100, 30.0) == ("100 of 1,100 people fitted", True)  # no pace yet
-    assert pace.line("people fitted", 200, 1100, 31.0) == ("200 of 1,100 people fitted, 0:09 left", False)
+    assert pace.line("people fitted", 200, 1100, 30.5) == ("200 of 1,100 people fitted, 0:04 left", False)
     assert pace.line("people fitted", 300, 1100, 40.0) == ("300 of 1,100 people fitted, 0:40 left", True)
     assert pace.line("people fitted", 1100, 1100, 41.0) == ("1,100 of 1,100 people fitted", False)
     assert pace.line("people fitted", 100, 1100, 42.0)[0] == "100 of 1,100 people fitted"  # the next pass
+    assert pace.line("people fitted", 300, 1100, 42.9) == ("300 of 1,100 people fitted, 0:04 left", False)
+    assert pace.line("folds", 1, 9, 50.0) == ("1 of 9 folds", True)
+    assert pace.line("folds", 2, 9, 51.5) == ("2 of 9 folds, 0:10 left", True)  # soon, since it tells the time left
+    assert pace.line("folds", 3, 9, 53.0) == ("3 of 9 folds, 0:09 left", False)
     assert pace.line("rows read", 50_000, None, 43.0) == ("50,000 rows read", True)
 
 

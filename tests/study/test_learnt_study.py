@@ -16,6 +16,8 @@ from studies import SOUND
 from hilbo import Session
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials
+from hilbo.population.judged.leave_one_out import leave_one_out_learnt
+from hilbo.population.judged.left_out_kept import leave_one_out_kept
 from hilbo.population.maps import learnt_map
 from hilbo.population.rules.registry import RECOMMENDED
 from hilbo.search.candidates import search_points
@@ -91,6 +93,19 @@ def test_learnt_2_seeks_its_optimum_where_the_best_is_most_often_near(learnt_2):
     assert float(nearness(map_.shared.gp.kernel, places.points, places.share, optimum.x)) >= near[known].max() - 1e-12
     assert float(optimum.class_probabilities[-1]) >= chance[known].max() - 0.05 - 1e-6
     assert float(optimum.sd**2) <= float(map_.reach) * (1 + 1e-6)
+
+
+@pytest.mark.deep  # three programs of whole fits are compiled
+def test_left_out_people_are_predicted_as_by_maps_without_them(learnt_2):
+    """The maps take an eigendecomposition, and all points; with an effect, and in groups of two sizes."""
+    study, cohort, _ = learnt_2
+    groups, folds = [np.array([0, 2]), np.array([3])], []
+    fast = leave_one_out_kept(study.learnt, cohort.trials, groups, lambda done, of: folds.append((done, of)))
+    by_maps, _ = leave_one_out_learnt(study.learnt, cohort.trials, study.stated, again=False, groups=groups)
+    np.testing.assert_allclose(fast.probabilities, by_maps.probabilities, rtol=1e-10)
+    np.testing.assert_allclose(fast.log_given, by_maps.log_given, rtol=1e-10)
+    np.testing.assert_array_equal([fast.person, fast.q], [by_maps.person, by_maps.q])
+    assert fast.not_converged == by_maps.not_converged == 0 and folds == [(1, 2), (2, 2)]
 
 
 def test_what_the_file_states_is_kept():

@@ -59,7 +59,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.
 JsonToo = Annotated[bool, typer.Option("--json", help="Print the output as JSON on stdout.")]
 
 PARTS = ("video-quality", "simulated-memory-foam")
-_EVERY = 10.0  # s
+_EVERY, _SOON = 10.0, 1.0  # s, between lines of progress; before the first one with the time left
 
 
 def seed_option(what: str) -> Any:
@@ -216,6 +216,7 @@ class _Pace:
 
     def __init__(self) -> None:
         self.text, self.done, self.first, self.last_shown = "", 0, (0, 0.0), -math.inf
+        self.foreseen = False  # whether a line with the time left was printed
 
     def line(self, text: str, done: int | None, people: int | None, now: float) -> tuple[str, bool]:
         """The line at the time `now` (s), and whether to print it where lines cannot change: a new text, or `_EVERY` s
@@ -226,15 +227,17 @@ class _Pace:
         if text != self.text or done < self.done:  # the first report includes the compilation, and gives no pace
             again = text == self.text
             self.text, self.first, self.last_shown = text, (done, now), self.last_shown if again else -math.inf
+            self.foreseen = self.foreseen and again
         self.done = done
         done_before, time_before = self.first
         line = f"{done:,} {text}" if people is None else f"{done:,} of {people:,} {text}"
         if people is not None and done_before < done < people:
             left = round((now - time_before) / (done - done_before) * (people - done))
             line += f", {left // 60}:{left % 60:02d} left"
-        if now - self.last_shown < _EVERY:
+        foreseen = line.endswith("left") and not self.foreseen and now - self.last_shown >= _SOON
+        if now - self.last_shown < _EVERY and not foreseen:
             return line, False
-        self.last_shown = now
+        self.last_shown, self.foreseen = now, self.foreseen or foreseen
         return line, True
 
 

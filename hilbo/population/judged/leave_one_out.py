@@ -36,6 +36,8 @@ from hilbo.population.learnt.rule import Learnt, learn
 from hilbo.population.maps import RuleMap, learnt_map, rule_map
 from hilbo.population.newcomer import InTurn, predicted_in_turn, with_variances
 from hilbo.population.rules.registry import RECIPES
+from hilbo.population.shared.posterior import ContextEffects
+from hilbo.population.shared.scale_use import ScaleUse
 
 __all__ = [
     "LeftOut",
@@ -46,6 +48,7 @@ __all__ = [
     "leave_one_out",
     "leave_one_out_learnt",
     "left_out_by",
+    "newcomer_in_turn",
     "normal_scores",
     "reliability",
     "without",
@@ -266,19 +269,36 @@ def _newcomer(
     mask: Bool[Array, " m"],
     context: Int[Array, " m"] | None,
 ) -> InTurn:
+    """Predict a new participant's responses `q` (m,) at points (m, d), by a map; see `newcomer_in_turn`."""
+    apart = (1.0 - population_map.share) * population_map.prior
+    moments = *population_map.predict(x), apart, population_map.effects
+    return newcomer_in_turn(gp, moments, x, q, mask, context, population_map.scale)
+
+
+def newcomer_in_turn(
+    gp: OrdinalGP,
+    moments: tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, ""], ContextEffects | None],
+    x: Float[Array, "m d"],
+    q: Int[Array, " m"],
+    mask: Bool[Array, " m"],
+    context: Int[Array, " m"] | None,
+    scale: ScaleUse | None,
+) -> InTurn:
     """Predict a new participant's responses `q` (m,) at points (m, d), one after the other.
 
-    The participant's function has the map's mean and variance, and the kernel's correlation; responses in one context
-    of a random effect have its effect in common. `mask` (m,): False in rows without a response.
+    `moments`: mean and variance (m,) of the map there, the variance of one participant's function about it, and the
+    random effect or None. The participant's function has the kernel's correlation; responses in one context of a random
+    effect have its effect in common. `mask` (m,): False in rows without a response.
     """
-    mean, variance = population_map.newcomer(x, context)
-    covariance, effects = gram(gp.kernel, x, x), population_map.effects
+    mean, variance, apart, effects = moments
+    covariance, variance = gram(gp.kernel, x, x), variance + apart
     if effects is not None and context is not None:
-        apart = (1.0 - population_map.share) * population_map.prior
         of_context = jnp.sqrt(effects.variance[context])
         together = jnp.where(context[:, None] == context[None, :], jnp.outer(of_context, of_context), 0.0)
-        covariance = with_variances(covariance, population_map.predict(x)[1] + apart) + together
-    return predicted_in_turn(gp.likelihood, mean, with_variances(covariance, variance), q, mask, population_map.scale)
+        covariance = with_variances(covariance, variance) + together
+        shift, more = effects.added(x, context)
+        mean, variance = mean + shift, variance + more
+    return predicted_in_turn(gp.likelihood, mean, with_variances(covariance, variance), q, mask, scale)
 
 
 def _converged(map_: RuleMap) -> bool:

@@ -8,6 +8,7 @@ posterior; one that is hardly narrower than its prior is not identified.
 """
 
 import dataclasses
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -35,7 +36,7 @@ from hilbo.population.learnt.posterior import (
 from hilbo.population.learnt.search import LARGEST, first_search, searched
 from hilbo.population.learnt.spread import posterior_spread
 from hilbo.population.rules.recipes import LEARNT_1, WIDTHS, Recipe
-from hilbo.population.shared.features import pivots_for, unexplained
+from hilbo.population.shared.features import Pivots, pivots_for, unexplained
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.posterior import SharedFunction, shared_function
 from hilbo.population.shared.scale_use import INDIVIDUAL, ScaleUse
@@ -46,6 +47,7 @@ __all__ = [
     "Learnt",
     "drawn_maps",
     "learn",
+    "learnt_features",
     "learnt_function",
     "not_learnt",
 ]
@@ -103,9 +105,15 @@ def learnt_function(learnt: Learnt, trials: Trials) -> SharedFunction:
     `trials`: stacked (M, n), those that were learnt from, or some of them. Never raises for a fit that has not
     converged.
     """
-    answers = _as_learnt(learnt, trials)
-    pivots = pivots_for(learnt.model.unit, answers, most=_most_features(answers))
+    answers, pivots = learnt_features(learnt, trials)
     return shared_function(learnt.model, answers, learnt.weights, pivots)
+
+
+def learnt_features(learnt: Learnt, trials: Trials) -> tuple[Tallies, Pivots]:
+    """Counts of the responses, and the pivots of the shared function's features; arguments as for
+    `learnt_function`."""
+    answers = _as_learnt(learnt, trials)
+    return answers, pivots_for(learnt.model.unit, answers, most=_most_features(answers))
 
 
 def _as_learnt(learnt: Learnt, trials: Trials) -> Tallies:
@@ -123,12 +131,20 @@ class DrawnMap(NamedTuple):
     scale: ScaleUse | None
 
 
-def drawn_maps(learnt: Learnt, trials: Trials, stated: Stated, seed: int, count: int) -> list[DrawnMap]:
+def drawn_maps(
+    learnt: Learnt,
+    trials: Trials,
+    stated: Stated,
+    seed: int,
+    count: int,
+    say: Callable[[int, int], None] = lambda done, count: None,
+) -> list[DrawnMap]:
     """Maps for `count` draws of the hyperparameters from their normal posterior; individual sensitivities and widths
     stay.
 
     Draws whose fit does not converge are left out; the list is empty if the covariance is not positive definite, since
-    the search then ended at no maximum. `trials` and `stated`: those that were learnt from.
+    the search then ended at no maximum. `trials` and `stated`: those that were learnt from. `say`:
+    called with the number of maps done, and of all.
     """
     covariance = np.asarray(learnt.covariance + learnt.covariance.T) / 2
     if not np.all(np.isfinite(covariance)):
@@ -150,7 +166,10 @@ def drawn_maps(learnt: Learnt, trials: Trials, stated: Stated, seed: int, count:
         return DrawnMap(function, model, _scale_at(coordinates, learnt.model.fixed_point))
 
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
-        maps = list(pool.map(drawn, steps))
+        maps = []
+        for drawn_map in pool.map(drawn, steps):
+            maps.append(drawn_map)
+            say(len(maps), count)
     return [each for each in maps if bool(each.function.certificate.converged)]
 
 

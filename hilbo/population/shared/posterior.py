@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
 from hilbo.kernels import Stationary, gram
@@ -15,12 +15,12 @@ from hilbo.numerics.linalg import eigh
 from hilbo.numerics.sharding import of_each_person, sum_over_people
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
-from hilbo.population.shared.features import Pivots, root_of_pivots
-from hilbo.population.shared.low_rank import System, evidence_at, mode_of, newton_step, prior_of
+from hilbo.population.shared.features import Pivots, features_of, root_of_pivots
+from hilbo.population.shared.low_rank import Mode, System, evidence_at, mode_of, newton_step, prior_of
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.tallies import Tallies
 
-__all__ = ["ContextEffects", "SharedFunction", "shared_function"]
+__all__ = ["ContextEffects", "SharedFunction", "SharedMoments", "shared_function", "shared_moments"]
 
 
 class ContextEffects(eqx.Module):
@@ -64,7 +64,91 @@ def shared_function(model: PeopleModel, answers: Tallies, start: Float[Array, "M
     is explained. Weights of responses given at a pivot stay there: L, which may be nearly singular, only carries over
     the others. Never raises: read `certificate.converged`.
     """
+    solved = _solved(model, answers, start, pivots)
+    mode, system, weights, root = solved.mode, solved.system, solved.weights, solved.root
     rank = len(pivots.points)
+    factor = jnp.where(pivots.used[None, :], _explained(_without_effect(system.precision, rank), root), 0.0)
+
+    kernel = model.of_variance(model.shared)
+    covariance = gram(kernel, pivots.points, pivots.points)
+    smallest = jnp.min(jnp.diagonal(covariance) - jnp.sum((factor @ covariance) ** 2, axis=0))
+    resolution = jnp.finfo(root.dtype).eps * model.shared * root.shape[0] ** 0.5
+    rounding = _rounding(model, answers, mode.weights, covariance, weights)
+    known_well = evidence_known(solved.value, solved.error, rounding) & (smallest >= resolution)
+    certificate = Certificate(
+        residual=mode.residual,
+        tolerance=mode.tolerance,
+        iterations=mode.steps,
+        jitter=pivots.left,
+        condition=jnp.linalg.norm(system.precision),
+        smallest_variance=smallest,
+        variance_resolution=resolution,
+        evidence_error=solved.error,
+        evidence_tolerance=evidence_tolerance(solved.value),
+        evidence_rounding=rounding,
+        converged=(mode.residual <= mode.tolerance) & known_well,
+    )
+    latent = GaussianPosterior(covariance @ weights, weights, factor, factor.T @ factor, solved.value, certificate)
+    asked = Trials(pivots.points, jnp.zeros(rank, jnp.int32), pivots.carry)
+    function = Posterior(OrdinalGP(kernel, OrdinalProbit(model.thresholds, model.noise)), asked, latent)
+    return SharedFunction(function, _effects_of(model, system, solved.together, pivots.points, root))
+
+
+class SharedMoments(NamedTuple):
+    """Mean and variance (m,) of g at m points, the random effect, and whether the fit converged, all as by
+    `shared_function`."""
+
+    mean: Float[Array, " m"]
+    variance: Float[Array, " m"]
+    effects: ContextEffects | None
+    converged: Bool[Array, ""]
+
+
+def shared_moments(
+    model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], pivots: Pivots, x: Float[Array, "m d"]
+) -> SharedMoments:
+    """Mean and variance of the shared function g at few points `x` (m, d) of the unit cube.
+
+    What `shared_function` predicts there, to rounding, without its eigendecomposition: with S = C C' the explained
+    variance is |phi|^2 - |C^-1 phi|^2 of the features phi(x). Can be traced; never raises.
+    """
+    solved = _solved(model, answers, start, pivots)
+    mode, root, rank = solved.mode, solved.root, len(pivots.points)
+    lower = jnp.linalg.cholesky(_without_effect(solved.system.precision, rank))
+
+    def left(features: Float[Array, "m r"]) -> Float[Array, " m"]:
+        rest = solve_triangular(lower, features.T, lower=True)
+        return model.shared - model.shared * (jnp.sum(features**2, axis=1) - jnp.sum(rest**2, axis=0))
+
+    kernel = model.of_variance(model.shared)
+    covariance = gram(kernel, pivots.points, pivots.points)
+    at_pivots = jnp.where(pivots.used, left(root / jnp.sqrt(model.shared)), model.shared)
+    resolution = jnp.finfo(root.dtype).eps * model.shared * rank**0.5
+    rounding = _rounding(model, answers, mode.weights, covariance, solved.weights)
+    known_well = evidence_known(solved.value, solved.error, rounding) & (jnp.min(at_pivots) >= resolution)
+    return SharedMoments(
+        gram(kernel, x, pivots.points) @ solved.weights,
+        left(features_of(model.unit, pivots, x[None])[0]),
+        _effects_of(model, solved.system, solved.together, pivots.points, root),
+        (mode.residual <= mode.tolerance) & known_well,
+    )
+
+
+class _Solved(NamedTuple):
+    """Mode and system there; log evidence and its `error`; posterior mean F'a of the weights of g and of the effects
+    (`together`); Cholesky factor (r, r) of the covariance of g at the pivots (`root`), and their weights (r,)."""
+
+    mode: Mode
+    system: System
+    value: Float[Array, ""]
+    error: Float[Array, ""]
+    together: Float[Array, " p"]
+    root: Float[Array, "r r"]
+    weights: Float[Array, " r"]
+
+
+def _solved(model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], pivots: Pivots) -> _Solved:
+    """Laplace's method for all responses; arguments as for `shared_function`."""
     prior = prior_of(model, answers, pivots)
     mode = mode_of(model, answers, prior, start)
     value, slope, system = evidence_at(model, answers, prior, mode.weights)
@@ -74,32 +158,8 @@ def shared_function(model: PeopleModel, answers: Tallies, start: Float[Array, "M
 
     root = jnp.sqrt(model.shared) * root_of_pivots(model.unit, pivots)
     together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
-    weights = _weights_at(answers, mode.weights, prior.features[..., :rank], pivots, root)
-    factor = jnp.where(pivots.used[None, :], _explained(_without_effect(system.precision, rank), root), 0.0)
-
-    kernel = model.of_variance(model.shared)
-    covariance = gram(kernel, pivots.points, pivots.points)
-    smallest = jnp.min(jnp.diagonal(covariance) - jnp.sum((factor @ covariance) ** 2, axis=0))
-    resolution = jnp.finfo(root.dtype).eps * model.shared * root.shape[0] ** 0.5
-    rounding = _rounding(model, answers, mode.weights, covariance, weights)
-    known_well = evidence_known(value, error, rounding) & (smallest >= resolution)
-    certificate = Certificate(
-        residual=mode.residual,
-        tolerance=mode.tolerance,
-        iterations=mode.steps,
-        jitter=pivots.left,
-        condition=jnp.linalg.norm(system.precision),
-        smallest_variance=smallest,
-        variance_resolution=resolution,
-        evidence_error=error,
-        evidence_tolerance=evidence_tolerance(value),
-        evidence_rounding=rounding,
-        converged=(mode.residual <= mode.tolerance) & known_well,
-    )
-    latent = GaussianPosterior(covariance @ weights, weights, factor, factor.T @ factor, value, certificate)
-    asked = Trials(pivots.points, jnp.zeros(rank, jnp.int32), pivots.carry)
-    function = Posterior(OrdinalGP(kernel, OrdinalProbit(model.thresholds, model.noise)), asked, latent)
-    return SharedFunction(function, _effects_of(model, system, together, pivots.points, root))
+    weights = _weights_at(answers, mode.weights, prior.features[..., : len(pivots.points)], pivots, root)
+    return _Solved(mode, system, value, error, together, root, weights)
 
 
 def _weights_at(

@@ -10,6 +10,7 @@ difference exceeds the normal quantile of the error that the predicted probabili
 degree of freedom less than participants, of the error that is clustered by participant.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +18,11 @@ from jaxtyping import Float
 from scipy.special import ndtri, stdtrit
 
 from hilbo.population.judged.baselines import constant, quadratic
-from hilbo.population.judged.leave_one_out import LeftOut, clustered, leave_one_out, leave_one_out_learnt
+from hilbo.population.judged.leave_one_out import LeftOut, clustered, leave_one_out
+from hilbo.population.judged.left_out_kept import leave_one_out_kept
 from hilbo.population.rules.registry import RULES
 from hilbo.study.config import Study
-from hilbo.study.estimate.aggregate import Aggregate
+from hilbo.study.estimate.aggregate import Aggregate, SayCount, silent
 from hilbo.study.formats.json_file import Content
 
 __all__ = ["check_sentences", "model_check"]
@@ -31,13 +33,14 @@ _BASELINES = {"constant": "the same shares everywhere", "quadratic": "a quadrati
 _GROUPS = 12  # of people, in which the baselines leave them out
 
 
-def model_check(study: Study, aggregate: Aggregate) -> Content | None:
-    """Results of the model check as a dict for result.json; None for fewer than three participants with responses."""
+def model_check(study: Study, aggregate: Aggregate, say: SayCount = silent) -> Content | None:
+    """Results of the model check as a dict for result.json; None for fewer than three participants with responses.
+    `say`: progress."""
     cohort = aggregate.cohort
     answered = np.flatnonzero(cohort.counts() > 0)
     if len(answered) < 3:
         return None
-    left = _left_out(study, aggregate, answered)
+    left = _left_out(study, aggregate, answered, say)
     names, trials = cohort.names, cohort.trials
     mask = np.asarray(trials.mask)
     order = np.concatenate([np.flatnonzero(mask[p]) * 3 // mask[p].sum() for p in _people(left)])
@@ -111,7 +114,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-def _left_out(study: Study, aggregate: Aggregate, answered: np.ndarray) -> LeftOut:
+def _left_out(study: Study, aggregate: Aggregate, answered: np.ndarray, say: SayCount) -> LeftOut:
     """Cross-validated predictions, each participant left out alone, or in at most 24 groups (6 for slow methods).
     `answered`: rows of participants with responses."""
     trials = aggregate.cohort.trials
@@ -119,7 +122,7 @@ def _left_out(study: Study, aggregate: Aggregate, answered: np.ndarray) -> LeftO
     folds = min(_FOLDS if cheap else _DEAR_FOLDS, len(answered))
     groups = [answered[k::folds] for k in range(folds)]
     if study.learnt is not None:
-        return leave_one_out_learnt(study.learnt, trials, study.stated, again=False, groups=groups)[0]
+        return leave_one_out_kept(study.learnt, trials, groups, partial(say, "predictions of left-out participants"))
     share = aggregate.map.share if RULES[study.rule].learns_share else None
     return leave_one_out(
         study.gp,

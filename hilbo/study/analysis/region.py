@@ -6,6 +6,7 @@ included. Learnt hyperparameters are drawn too: fixed at their estimates, they w
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from hilbo.search.box import Parameter
 from hilbo.search.rendering import Rendering
 from hilbo.study.analysis.hills import Hill, hills_of
 from hilbo.study.config import Study
+from hilbo.study.estimate.aggregate import SayCount, silent
 from hilbo.study.estimate.best_places import DRAWS, POINTS, best_places
 from hilbo.study.estimate.optimum import predict_map
 
@@ -56,25 +58,33 @@ class Region(NamedTuple):
         return bool(near <= far)
 
 
-def hyperparameter_draws(study: Study, trials: Trials, seed: int = 0) -> list[DrawnMap]:
-    """Maps by drawn hyperparameters, of a study that has learnt them from stacked `trials`; otherwise none."""
+def hyperparameter_draws(study: Study, trials: Trials, seed: int = 0, say: SayCount = silent) -> list[DrawnMap]:
+    """Maps by drawn hyperparameters, of a study that has learnt them from stacked `trials`; otherwise none. `say`:
+    progress."""
     if study.learnt is None:
         return []
-    return drawn_maps(study.learnt, trials, study.stated, seed, _HYPERPARAMETERS)
+    report = partial(say, "maps with drawn hyperparameters")
+    return drawn_maps(study.learnt, trials, study.stated, seed, _HYPERPARAMETERS, report)
 
 
 def optimum_region(
-    study: Study, map_: RuleMap, drawn: Sequence[DrawnMap] = (), seed: int = 0, count: int = POINTS
+    study: Study,
+    map_: RuleMap,
+    drawn: Sequence[DrawnMap] = (),
+    seed: int = 0,
+    count: int = POINTS,
+    say: SayCount = silent,
 ) -> Region | None:
     """Credible region of the map's optimum; None for maps without a joint posterior (those aggregated point by point).
 
     `drawn`: of `hyperparameter_draws`. `count`: number of even points of the feasible set; a quarter as many are added
-    on its walls.
+    on its walls. `say`: progress.
     """
     if map_.shared is None:
         return None
     functions = [each.function for each in drawn] or [map_.shared]
-    places = best_places(study.space, study.goal, functions, seed, count, _DRAWS)
+    report = partial(say, "parts of the region of the optimum")
+    places = best_places(study.space, study.goal, functions, seed, count, _DRAWS, report)
     first, which = _distinct(np.asarray(places.points))
     points, weight = np.asarray(places.points)[first], np.bincount(which, np.asarray(places.share))
     mean, variance = (np.asarray(each)[first] for each in predict_map(map_, places.points))

@@ -31,6 +31,7 @@ from hilbo.population.judged.leave_one_out import (
     leave_one_out_learnt,
     reliability,
 )
+from hilbo.population.judged.left_out_kept import leave_one_out_kept
 from hilbo.population.maps import RuleMap, learnt_map, rule_map, share_of
 from hilbo.population.rules.registry import GIVEN, RECOMMENDED, RULES
 from hilbo.population.shared.hierarchical import Share
@@ -135,7 +136,7 @@ def _learnt_entry(learns: Study, ground: _Ground) -> tuple[LeftOut, dict[str, An
     assert learns.learnt is not None
     trials = ground.cohort.trials
     left, folds = leave_one_out_learnt(learns.learnt, trials, learns.stated)
-    kept, _ = leave_one_out_learnt(learns.learnt, trials, learns.stated, again=False)
+    kept = leave_one_out_kept(learns.learnt, trials)
     entry = _entry(learns, ground, learnt_map(learns.learnt, trials), left, folds)
     entry["hyperparameters"] = "learnt in each fold"
     entry["negative_log_density_kept"] = float(kept.cost.mean())

@@ -49,6 +49,7 @@ __all__ = [
     "asked_variance",
     "fit_cohort",
     "other_inference",
+    "silent",
 ]
 
 MANY = 1000
@@ -65,7 +66,7 @@ SayCount = Callable[[str, int, int], None]
 """Progress report: description, number of participants done, number of all."""
 
 
-def _silent(words: str, done: int, people: int) -> None:
+def silent(words: str, done: int, people: int) -> None:
     """Ignore a progress report."""
     del words, done, people
 
@@ -172,7 +173,7 @@ class Aggregate(eqx.Module):
 def fit_cohort(study: Study, cohort: Cohort, inference: Inference | None = None) -> Posterior:
     """Posterior of each participant, stacked (M). `inference`: instead of the study's. Fits that fail do not raise; see
     their certificates."""
-    return _fitted(study, cohort, inference, _silent)
+    return _fitted(study, cohort, inference, silent)
 
 
 def _fitted(study: Study, cohort: Cohort, inference: Inference | None, say: SayCount) -> Posterior:
@@ -224,7 +225,7 @@ def aggregate_cohort(
     first: First = lambda optimum, map_: None,
     *,
     individuals: bool = True,
-    say: SayCount = _silent,
+    say: SayCount = silent,
 ) -> Aggregate:
     """Fit all participants, aggregate, and find the optima; the study's `rule` determines the population optimum.
 

@@ -5,7 +5,7 @@ point is the posterior probability that this point is the best of them; with pos
 hyperparameters, these are integrated out.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
@@ -49,16 +49,20 @@ def best_places(
     seed: int = 0,
     count: int = POINTS,
     draws: int = DRAWS,
+    say: Callable[[int, int], None] = lambda done, functions: None,
 ) -> BestPlaces:
     """Distribution of the optimum over `count` even points of the feasible set and a quarter as many on its walls.
 
     `functions`: equally probable posteriors, of each of which draws / number of posteriors (rounded up) are drawn. Two
-    posteriors are processed at a time, in threads.
+    posteriors are processed at a time, in threads. `say`: called with the number of posteriors done, and of all.
     """
     points, each = search_points(space, seed, count), -(-draws // len(functions))
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
         seeds = map(to_device, range(seed, seed + len(functions)))
-        shares = list(pool.map(lambda function, seed: _shares(function, goal, points, seed, each), functions, seeds))
+        shares = []
+        for share in pool.map(lambda function, seed: _shares(function, goal, points, seed, each), functions, seeds):
+            shares.append(jax.block_until_ready(share))
+            say(len(shares), len(functions))
     return BestPlaces(points, sum(shares[1:], shares[0]) / len(shares))
 
 
