@@ -16,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from hilbo.errors import InputError
@@ -76,7 +77,7 @@ def map_dataset(study: Study, surface: Callable[..., Any], cells: int = CELLS) -
 
 
 def _in_blocks(
-    surface: Callable[..., Any], x: Float[np.ndarray, "m d"]
+    surface: Callable[..., tuple[ArrayLike, ArrayLike]], x: Float[np.ndarray, "m d"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Mean and variance (m,) of a map at many points, from blocks of one size: covariances with all points at once
     would take hundreds of megabytes. The last block is filled up with copies of the last point."""
