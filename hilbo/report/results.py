@@ -355,6 +355,7 @@ def _figures(
     """
     from hilbo.report.figures import maps
     from hilbo.report.figures.effects import effects_figure
+    from hilbo.report.figures.goal_map import goal_map
     from hilbo.report.figures.progress import progress_figure
 
     study, aggregate = population.study, population.aggregate
@@ -363,6 +364,7 @@ def _figures(
         return figures, {"drawn": drawn}
     best = np.asarray(aggregate.optimum.x)
     figures = {
+        "goal-map": goal_map(study, aggregate, population.region),
         "map": maps.map_slices(study, aggregate.surface, best, population.cohort),
         "progress": progress_figure(study, population, truth),
         "slices": maps.slices_after(study, population.progress),

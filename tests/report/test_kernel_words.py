@@ -46,5 +46,5 @@ def test_every_kernel_of_a_rule_has_words():
 
 
 def test_levels_are_said():
-    assert formula(RBF(1.0, levels=(0, 3))).endswith("count as 1 apart")
+    assert formula(RBF(1.0, levels=(0, 3))).endswith("two different levels of a parameter have the distance 1")
     assert "levels" not in formula(RBF(1.0, levels=(0, 0)))

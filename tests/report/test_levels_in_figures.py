@@ -13,13 +13,14 @@ from studies import PLAIN
 from surfaces import SURFACES, TEXTURES, surfaces
 
 from hilbo.ordinal_gp import Trials, fit
-from hilbo.report.figures import on_axes, regions
+from hilbo.report.figures import goal_map, on_axes, regions
 from hilbo.report.figures.population import coverage_figure
 from hilbo.report.figures.progress import progress_figure
 from hilbo.report.figures.study import _sets_on_curve
 from hilbo.report.results import misses
 from hilbo.study.analysis.cohort_results import CohortResults
 from hilbo.study.analysis.progress import Progress
+from hilbo.study.analysis.region import Region
 from hilbo.study.config import Study
 
 LEVELS = [0.0, 0.5, 1.0]
@@ -100,3 +101,13 @@ def test_distances_to_the_truth_are_those_of_the_tables(monkeypatch):
     expected = 100 * misses(study, optima, truth)[0]
     for line in left.lines[:2]:  # of individuals, of which there is one, and of the population
         np.testing.assert_allclose(line.get_ydata(), expected)
+
+
+@pytest.mark.parametrize("study", [ONE, Study.from_dict(PLAIN)])
+def test_the_outline_of_the_card_is_the_region(study):
+    """Each even point is drawn inside exactly if it is of the region."""
+    even = np.unique(np.asarray(study.space.candidates(64, 0)), axis=0)
+    rows = np.arange(len(even)) % 3 == 0
+    region = Region(even[rows], even[~rows], float(rows.mean()))
+    np.testing.assert_array_equal(goal_map.held(region, even, study.gp.kernel), rows)
+    assert [region.holds(x, study.gp.kernel) for x in even] == rows.tolist()

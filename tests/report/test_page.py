@@ -194,7 +194,7 @@ def test_the_card_of_a_page_has_the_answer(region):
     content = {"optimum": {"parameters": best, "class_probabilities": {"bad": 0.2, "good": 0.8}}, "rule": "learnt-2"}
     content |= {"highest_answer": {"low": 0.6, "high": 0.9}, "key_numbers": numbers}
     content["optimum_region"] = region and {"probability": 0.95, "volume": 0.1, "located": True, "parameters": region}
-    card = _environment().from_string('{% import "card.html" as answer %}{{ answer.card(study, content, 3, 60) }}')
+    card = _environment().from_string('{% import "card.html" as answer %}{{ answer.card(study, content, 3, 60, {}) }}')
     text = unescape(card.render(study=dataclasses.replace(study, learnt=object()), content=content))
     assert tomllib.loads(re.search(r"<pre>(.*?)</pre>", text, re.S)[1])["optimum"] == best
     said = " ".join(text.split())

@@ -139,7 +139,7 @@ def test_the_page_is_whole_and_needs_nothing_else(written):
     text = (folder / "report.html").read_text(encoding="utf-8")
     page = Page(text)
     assert "<any & all>" not in text and "&lt;any &amp; all&gt;" in text
-    assert len(page.images) == {1: 3, 2: 4, 4: 5}[study.space.dim]
+    assert len(page.images) == {1: 4, 2: 5, 4: 6}[study.space.dim]
     assert all(image["alt"] and image["src"].startswith("data:image/png;base64,") for image in page.images)
     assert page.captions == 3 and page.heads > 10
     assert "://" not in text and "<script" not in text and "nan" not in text.lower().replace("base64", "")[:2000]

@@ -99,7 +99,7 @@ def test_table_iv_is_called_what_it_is(ties, words):
     section = validation_section(validated) | {"figures": {}}
     content = {"study": "", "seed": 0, "versions": {}}
     page = rendered("validation.html", study=plain(), content=content, warnings=[], sections=[section])
-    caption = " ".join(re.search(r"individuals&#39; own.*?</caption>", page, re.DOTALL).group().split())
+    caption = " ".join(re.search(r"preferred to the individual sets.*?</caption>", page, re.DOTALL).group().split())
     assert words in caption and "table_IV.csv" in caption and ("nearer to one half" in caption) == (ties > 0)
     row = safest(validated.tables.table_4).set_index("term").loc["Aggregate-Best"]
     probability, share = 1 / (1 + np.exp(-row["estimate"])), validated.overall["rate"].iloc[0]

@@ -26,6 +26,7 @@ def study_figures(
     from hilbo.report.figures import maps, people, study
     from hilbo.report.figures import progress as progress_figures
     from hilbo.report.figures.effects import effects_figure
+    from hilbo.report.figures.goal_map import goal_map
     from hilbo.report.figures.regions import class_regions
 
     chosen, cohort, aggregate, progress = analysis.study, analysis.cohort, analysis.aggregate, analysis.progress
@@ -37,6 +38,7 @@ def study_figures(
     }
     map_, hatched = study.sets_on_map(chosen, aggregate.surface, analysis.sets, best, cohort, prior)
     figures = {
+        "goal-map": goal_map(chosen, aggregate, analysis.population.region),
         "progression": study.posterior_progress(chosen, cohort, progress, study.typical_person(analysis)),
         "convergence": progress_figures.individual_convergence(chosen, cohort, progress),
         "map": map_,
