@@ -8,6 +8,7 @@ JOBS ?= 2
 # and a worker of theirs takes up to 6 GB.
 TEST_JOBS ?= 3
 PYTEST_ARGS ?=
+NOTEBOOKS ?= yes
 
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.hilbo-setup
@@ -47,11 +48,12 @@ lint: $(STAMP)  ## ruff and pyright
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-docs: $(DOCS_STAMP)  ## the documentation as a site, into build/site; a broken link or anchor is an error
+docs: $(DOCS_STAMP)  ## the documentation as a site, into build/site; a broken link or anchor is an error; NOTEBOOKS=no runs no notebook
+	$(if $(filter no,$(NOTEBOOKS)),,$(BIN)/python docs/site/notebooks.py --changed)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "open build/site/index.html"
 
-notebooks: $(DOCS_STAMP)  ## the notebooks as .ipynb with their outputs, into build/notebooks; make docs shows what is there
+notebooks: $(DOCS_STAMP)  ## all notebooks as .ipynb with their outputs, into build/notebooks, from where make docs takes them
 	$(BIN)/python docs/site/notebooks.py
 
 wheel:  ## the sdist and the wheel, into dist, and what a stranger does with them in fresh environments

@@ -3,6 +3,8 @@
 import importlib.util
 import json
 import re
+import shutil
+import subprocess
 import tomllib
 from itertools import pairwise
 from pathlib import Path
@@ -104,7 +106,7 @@ def test_the_reference_begins_with_the_public_objects_and_repeats_none():
     made = script("api_pages")
     page = made.objects()
     for name in hilbo.__all__:
-        assert f"[`hilbo.{name}`][{getattr(hilbo, name).__module__}.{name}]" in page
+        assert f"[`{name}`][{getattr(hilbo, name).__module__}.{name}]" in page
     shown = re.findall(r"members: \[(.*)\]", "".join(made.reference(*entry) for entry in made.API.values()))
     names = [name for members in shown for name in members.split(", ")]
     classes = [name for name in hilbo.__all__ if name[0].isupper()]
@@ -150,7 +152,17 @@ def test_a_notebook_becomes_text_and_code(tmp_path, monkeypatch):
     assert "```text\none\ntwo\n```" in shown and "base64,abc" in shown and 'href="quick_start.ipynb"' in shown
     book[1]["source"] += "\nmore()"  # not this script's any more
     (tmp_path / "quick_start.ipynb").write_text(json.dumps({"cells": book}))
-    assert made.notebook(path) == page
+    assert made.outputs(path) is None and made.notebook(path) == page
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_the_site_runs_changed_notebooks_unless_told_not_to():
+    shown = [
+        subprocess.run(["make", "-n", "docs", *given], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        for given in ([], ["NOTEBOOKS=no"])
+    ]
+    assert ["docs/site/notebooks.py --changed" in text for text in shown] == [True, False]
+    assert all("mkdocs build --strict" in text for text in shown)
 
 
 def test_links_between_files_become_links_between_pages():

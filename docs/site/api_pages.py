@@ -61,7 +61,7 @@ def objects() -> str:
     lines = ["# The public objects", "", _OPENING, "", "| object | what it is |", "|---|---|"]
     for name in _listed(PACKAGE / "__init__.py"):
         module, node = _definition(place[name], name)
-        lines.append(f"| [`hilbo.{name}`][{module}.{name}] | {_sentence(node)} |")
+        lines.append(f"| [`{name}`][{module}.{name}] | {_sentence(node)} |")
     lines += ["", "## Modules", "", "| module | what it has |", "|---|---|"]
     for name in modules:
         shown = f"[`hilbo.{name}`][hilbo.{name}]" if f"hilbo.{name}" in documented else f"`hilbo.{name}`"

@@ -15,7 +15,7 @@ from formulas import rendered
 
 ROOT = Path(__file__).parents[2]
 FENCE = "```"
-EXECUTED = ROOT / "build" / "notebooks"  # what `make notebooks` makes; where it was not made, pages show the code alone
+EXECUTED = ROOT / "build" / "notebooks"  # with outputs, kept between builds; without them pages show the code alone
 
 ELSEWHERE = {
     "README.md": "readme.md",
@@ -46,16 +46,21 @@ def cells(path: Path) -> list[tuple[str, str]]:
     ]
 
 
-def notebook(path: Path) -> str:
-    """A percent script as Markdown: its text, and its code in fences, with what `make notebooks` has made of it."""
+def outputs(path: Path) -> list[dict] | None:
+    """The cells of a script with their outputs in `EXECUTED`; None if it was not run, or has changed since."""
     executed = EXECUTED / f"{path.stem}.ipynb"
     made = json.loads(executed.read_text(encoding="utf-8"))["cells"] if executed.exists() else []
-    parts, current = [], [(cell["cell_type"], "".join(cell["source"])) for cell in made] == cells(path)
+    return made if [(cell["cell_type"], "".join(cell["source"])) for cell in made] == cells(path) else None
+
+
+def notebook(path: Path) -> str:
+    """A percent script as Markdown: its text, and its code in fences, each followed by its outputs if it was run."""
+    parts, made = [], outputs(path)
     for number, (kind, body) in enumerate(cells(path)):
         parts.append(body if kind == "markdown" else f"{FENCE}python\n{body}\n{FENCE}")
-        parts += [_output(output) for output in made[number].get("outputs", [])] if current else []
+        parts += [_output(output) for output in made[number].get("outputs", [])] if made else []
     parts.append(f"Run it with `python {path.relative_to(ROOT)}`; editors show its cells.")
-    if current:
+    if made:
         parts[-1] += f' Or open <a href="{path.stem}.ipynb" download>the notebook</a>.'
     return "\n\n".join(part for part in parts if part) + "\n"
 

@@ -1,13 +1,15 @@
 """Every script of notebooks/ as a notebook with its outputs, run in an empty folder: `make notebooks`.
 
+--changed, as in `make docs`: only of scripts that have changed since they were run.
 HILBO_NOTEBOOK_TRIALS=7 makes the sessions in them short.
 """
 
+import argparse
 import tempfile
 from pathlib import Path
 
 import nbformat
-from hooks import EXECUTED, NOTEBOOKS, ROOT, cells
+from hooks import EXECUTED, NOTEBOOKS, ROOT, cells, outputs
 from nbclient import NotebookClient
 
 
@@ -25,8 +27,13 @@ def executed(path: Path, folder: str) -> nbformat.NotebookNode:
 
 
 def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("--changed", action="store_true")
+    chosen = options.parse_args()
     EXECUTED.mkdir(parents=True, exist_ok=True)
     for name in NOTEBOOKS:
+        if chosen.changed and outputs(ROOT / name) is not None:
+            continue
         with tempfile.TemporaryDirectory() as folder:
             book = executed(ROOT / name, folder)
         made = EXECUTED / f"{Path(name).stem}.ipynb"
