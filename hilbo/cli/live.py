@@ -10,6 +10,7 @@ import itertools
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -221,10 +222,20 @@ def doctor(
         results.append(check)
         fix = f"\n       -> {check.fix}" if check.fix else ""
         print(f"{marks[check.level]}  {check.name}: {check.words}{fix}", file=sys.stderr, flush=True)
+    print(_verdict([check.level for check in results]), file=sys.stderr)
     if as_json:
         print(json.dumps([check._asdict() for check in results], indent=2))
     if any(check.level == "bad" for check in results):
         raise typer.Exit(1)
+
+
+def _verdict(levels: Sequence[str]) -> str:
+    """The last line of `hilbo doctor`: whether a session can begin, from the levels of all checks."""
+    bad, notes = levels.count("bad"), levels.count("note")
+    noted = f", {notes} with a note" if notes else ""
+    if bad:
+        return f"NOT READY: {bad} of {len(levels)} checks failed{noted}."
+    return f"READY: {len(levels)} checks, none failed{noted}."
 
 
 def live(

@@ -70,7 +70,8 @@ def add(
     from hilbo.session.plan.participants import add_person
 
     row = {"participant": participant, "consent_time": consent_time, "protocol_number": protocol_number}
-    add_person(table, row | {"age": age, "handedness": handedness})
+    people = add_person(table, row | {"age": age, "handedness": handedness})
+    typer.echo(f"{table}: participant {participant} added, {len(people)} in all", err=True)
 
 
 @app_participants.command("delete")

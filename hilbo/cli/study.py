@@ -2,6 +2,8 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -62,7 +64,8 @@ def power(
 ) -> None:
     """Find how many participants and trials are enough for a given error of the optimum, by simulated studies.
 
-    Writes result.json, a table, figures and report.html to the folder --out.
+    Writes result.json, a table, figures and report.html to the folder --out; after Ctrl-C those of the finished
+    studies, if there are two.
     """
     begun = time.perf_counter()
     with results(out, force) as folder, progress() as say:
@@ -81,9 +84,12 @@ def power(
         plan = Plan(_numbers(participants, "--participants"), _numbers(trials, "--trials"), studies, seed)
         jobs = min(jobs or cores(), studies)
         say(f"simulating {studies} studies in {jobs} processes")
-        errors = simulate_power(
-            chosen, population, plan, jobs=jobs, begin=start, say=lambda done: say("studies", done, studies)
-        )
+        count = partial(say, "designs of simulated studies")
+        errors = simulate_power(chosen, population, plan, jobs=jobs, begin=start, say=count)
+        finished = errors["study"].nunique()
+        if finished < studies:
+            say.tell([f"Interrupted: the results are of the {finished} of {studies} studies that were finished."])
+            plan = replace(plan, studies=finished)
         cost = {
             "seconds": time.perf_counter() - begun,
             "jobs": jobs,

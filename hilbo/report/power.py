@@ -33,7 +33,7 @@ def enough(summary: pd.DataFrame, chance: float = _CHANCE) -> pd.DataFrame:
     return good.reindex(sorted(summary["participants"].unique())).rename("trials").reset_index()
 
 
-def _hours(study: Study, participants: float, trials: float) -> float | None:
+def _hours(study: Study, participants: int | float, trials: int | float) -> float | None:
     """Duration of the steps of all sessions of a design, warm-up included, h; None for an unknown number of trials.
     Answers and breaks are not included."""
     if np.isnan(trials):

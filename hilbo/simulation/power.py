@@ -15,10 +15,13 @@ Studies are dealt to processes, one core each; the numbers do not depend on how 
 
 import contextlib
 import json
+import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
+from multiprocessing.queues import SimpleQueue
 
 import equinox as eqx
 import jax
@@ -47,6 +50,7 @@ __all__ = ["Plan", "cores", "goal_probability", "one_study", "power_table", "sim
 
 _POINTS = 256  # at which maps are compared
 _CROWD = 2000  # people whose mean is the population's truth
+_counted: list[SimpleQueue] = []  # in a process of the pool
 _ONE_CORE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
@@ -74,14 +78,16 @@ def simulate_power(
     *,
     jobs: int | None = None,
     begin: Callable[[], None] | None = None,
-    say: Callable[[int], None] = lambda done: None,
+    say: Callable[[int, int], None] = lambda done, designs: None,
 ) -> pd.DataFrame:
     """Errors of every study at every (m, t): columns `study`, `participants`, `trials`, `optimum`, `map`.
 
+    After an interruption (`KeyboardInterrupt`) the errors of the finished studies, if there are two.
+
     `jobs`: number of processes, by default that of the cores. All are new processes, even a single one, so that a
     script must guard its main part with `if __name__ == "__main__":`. Each calls `begin` first (float64, a cache), if
-    given; otherwise it computes with JAX's defaults. `say` receives the number of finished studies. Raises `InputError`
-    for numbers of participants or responses that the study's method cannot aggregate.
+    given; otherwise it computes with JAX's defaults. `say` receives the number of (m, t) done in all studies, and of
+    all. Raises `InputError` for numbers of participants or responses that the study's method cannot aggregate.
     """
     if not study.one_optimum:
         raise InputError(
@@ -92,12 +98,31 @@ def simulate_power(
     jobs = min(cores() if jobs is None else jobs, plan.studies)
     sent = study.file.content, study.rule, population_, plan
     blocks: dict[int, pd.DataFrame] = {}
-    with _pool(jobs, begin) as pool:  # of one process too: several cores add up in another order
+    designs = plan.studies * len(plan.participants) * len(plan.trials)
+    with _pool(jobs, begin) as (pool, counted):  # of one process too: several cores add up in another order
+        counting = threading.Thread(target=_count, args=(counted, designs, say), daemon=True)
+        counting.start()
         work = {pool.submit(_study_in_process, *sent, i): i for i in range(plan.studies)}
-        for done in as_completed(work):
-            blocks[work[done]] = done.result()
-            say(len(blocks))
-    return pd.concat([blocks[index] for index in range(plan.studies)], ignore_index=True)
+        try:
+            for done in as_completed(work):
+                blocks[work[done]] = done.result()
+        except KeyboardInterrupt:
+            for process in multiprocessing.active_children():
+                process.terminate()
+            if len(blocks) < 2:
+                raise
+        else:
+            counted.put(False)
+            counting.join()
+    return pd.concat([blocks[index] for index in sorted(blocks)], ignore_index=True)
+
+
+def _count(counted: SimpleQueue, designs: int, say: Callable[[int, int], None]) -> None:
+    """Call `say` with the number of designs done, of all `designs`, for each True in the queue, until False comes."""
+    done = 0
+    while counted.get():
+        done += 1
+        say(done, designs)
 
 
 def _check_rule(rule: str, plan: Plan) -> None:
@@ -122,14 +147,16 @@ def cores() -> int:
 
 
 @contextlib.contextmanager
-def _pool(jobs: int, initializer: Callable[[], None] | None) -> Iterator[ProcessPoolExecutor]:
-    """Context manager with a pool of `jobs` new processes of one core each, which call `initializer` first. Sets
-    XLA_FLAGS in this process's environment, which they inherit, and restores it at the end."""
-    before = os.environ.get("XLA_FLAGS")
+def _pool(jobs: int, begin: Callable[[], None] | None) -> Iterator[tuple[ProcessPoolExecutor, SimpleQueue]]:
+    """Context manager with a pool of `jobs` new processes of one core each, which call `begin` first, and a queue to
+    which they put True for each design that is done. Sets XLA_FLAGS in this process's environment, which they inherit,
+    and restores it at the end."""
+    before, context = os.environ.get("XLA_FLAGS"), get_context("spawn")
     os.environ["XLA_FLAGS"] = f"{before or ''} {_ONE_CORE}".strip()
+    counted = context.SimpleQueue()
     try:
-        with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=initializer) as pool:
-            yield pool
+        with ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=(begin, counted)) as pool:
+            yield pool, counted
     finally:
         if before is None:
             del os.environ["XLA_FLAGS"]
@@ -137,16 +164,25 @@ def _pool(jobs: int, initializer: Callable[[], None] | None) -> Iterator[Process
             os.environ["XLA_FLAGS"] = before
 
 
+def _begin(begin: Callable[[], None] | None, counted: SimpleQueue) -> None:
+    """Begin a process of the pool, and keep the queue for `_study_in_process`."""
+    _counted.append(counted)
+    if begin is not None:
+        begin()
+
+
 def _study_in_process(content: str, rule: str, population_: Population, plan: Plan, index: int) -> pd.DataFrame:
     """Simulate study number `index` of the plan and return its errors, from arguments that can be sent to another
     process. `content`: the study file as JSON; `rule`: aggregation method."""
     study = by_rule(Study.from_dict({"schema": 1} | json.loads(content)), rule)
-    return one_study(study, population_, plan, index)
+    return one_study(study, population_, plan, index, lambda: _counted[0].put(True))
 
 
-def one_study(study: Study, population_: Population, plan: Plan, index: int) -> pd.DataFrame:
+def one_study(
+    study: Study, population_: Population, plan: Plan, index: int, done: Callable[[], None] = lambda: None
+) -> pd.DataFrame:
     """Simulate study number `index` of the plan; returns its errors at every (m, t), in the columns of
-    `simulate_power`."""
+    `simulate_power`. `done` is called after each (m, t)."""
     most, longest = max(plan.participants), max(plan.trials)
     seed = int(np.random.default_rng([plan.seed, index]).integers(2**31))
     staged = _with_trials(study, longest)
@@ -175,6 +211,7 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
             x = np.asarray(map_optimum(judged, map_, candidates).x)
             probabilities = np.asarray(_map_goal_probability(judged, map_, points))
             rows[m, count] = _rms(differences(persons.levels, x, truth)), _rms(probabilities - target)
+            done()
     cells = [(index, m, count, *rows[m, count]) for count in plan.trials for m in plan.participants]
     return pd.DataFrame(cells, columns=["study", "participants", "trials", "optimum", "map"])
 

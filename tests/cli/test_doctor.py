@@ -3,6 +3,7 @@
 import pytest
 
 from hilbo.cli import doctor
+from hilbo.cli.live import _verdict
 from hilbo.study.config import Study
 from hilbo.study.template import NewStudy, parameter_of, study_text
 
@@ -25,6 +26,17 @@ def test_folders_that_a_session_makes_are_no_fault(folder, name):
 def test_what_no_session_can_write_to_is_a_fault(folder, name):
     check = doctor._disk(folder / name)
     assert check.level == "bad" and check.words.startswith(f"{folder / name.partition('/')[0]}: ") and check.fix
+
+
+@pytest.mark.parametrize(
+    ("levels", "line"),
+    [
+        (["good", "note", "good"], "READY: 3 checks, none failed, 1 with a note."),
+        (["good", "bad", "bad"], "NOT READY: 2 of 3 checks failed."),
+    ],
+)
+def test_the_last_line_says_whether_a_session_can_begin(levels, line):
+    assert _verdict(levels) == line
 
 
 def test_a_study_of_one_trial_has_no_step_to_measure(tmp_path):

@@ -110,7 +110,8 @@ def test_a_wrong_plan_is_one_sentence(hilbo, tmp_path, arguments, sentence):
 
 def test_participants_are_listed_and_deleted(hilbo, tmp_path):
     consent = ("--consent-time", "2026-05-04T10:00", "--protocol-number", "7")
-    assert hilbo("participants", "add", "participants.csv", "P01", *consent)[0] == 0
+    code, _, err = hilbo("participants", "add", "participants.csv", "P01", *consent)
+    assert code == 0 and err == "participants.csv: participant P01 added, 1 in all\n"
     assert hilbo("participants", "add", "participants.csv", "P01", *consent)[0] == 2
     code, _, err = hilbo("participants", "delete", ".", "P01")
     assert code == 2 and "add --yes" in err and "P01" in (tmp_path / "participants.csv").read_text()

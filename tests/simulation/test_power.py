@@ -1,8 +1,11 @@
 """Simulated studies for planning: truths in closed form, prefixes that are studies of their own, and bad plans."""
 
+import contextlib
 import dataclasses
 import json
+import multiprocessing
 import sys
+from concurrent.futures import Future
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +21,7 @@ from hilbo.errors import InputError
 from hilbo.likelihoods import Goal
 from hilbo.report.figures.power import power_figure
 from hilbo.report.power import _hours, enough, write_power
+from hilbo.simulation import power
 from hilbo.simulation.power import (
     Plan,
     _with_trials,
@@ -167,6 +171,43 @@ def test_the_command_says_what_it_cost(capsys, monkeypatch, tmp_path):
     assert len(pd.read_csv(out / "errors.csv")) == 4 and len(content["summary"]) == 2
     page = " ".join((out / "report.html").read_text().split())
     assert "on 2 cores" in page and page.count("data:image/png;base64,") == 1
+
+
+def test_the_studies_that_were_finished_before_an_interruption_are_returned(monkeypatch):
+    def finished(after):
+        def interrupted(work):
+            yield from list(work)[:after]
+            raise KeyboardInterrupt
+
+        return interrupted
+
+    def a_study(*sent):
+        future = Future()
+        future.set_result(pd.DataFrame({"study": [sent[-1]], "optimum": 0.1}))
+        return future
+
+    class Pool:
+        def submit(self, _function, *sent):
+            return a_study(*sent)
+
+    queue = multiprocessing.get_context("spawn").SimpleQueue()
+    queue.put(False), queue.put(False)
+    monkeypatch.setattr(power, "_pool", lambda jobs, begin: contextlib.nullcontext((Pool(), queue)))
+    monkeypatch.setattr(power.multiprocessing, "active_children", list)
+    plan = Plan((2, 3), (6,), 5, 0)
+    monkeypatch.setattr(power, "as_completed", finished(3))
+    assert simulate_power(study(), PRESETS["paper"], plan, jobs=1)["study"].tolist() == [0, 1, 2]
+    monkeypatch.setattr(power, "as_completed", finished(1))
+    with pytest.raises(KeyboardInterrupt):
+        simulate_power(study(), PRESETS["paper"], plan, jobs=1)
+
+
+@pytest.mark.deep
+def test_designs_are_counted_while_they_are_simulated():
+    counts = []
+    plan = Plan((2, 3), (6,), 2, 1)
+    simulate_power(study(), PRESETS["paper"], plan, jobs=2, begin=start, say=lambda *each: counts.append(each))
+    assert counts == [(done, 4) for done in (1, 2, 3, 4)]
 
 
 @pytest.mark.deep
