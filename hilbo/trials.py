@@ -123,9 +123,14 @@ class Trials(eqx.Module):
 
 
 def _array(name: str, value: Any) -> np.ndarray:
-    """Value as a NumPy array; `name` is for the error. Raises `InputError` for rows of different lengths."""
+    """Value as a NumPy array; `name` is for the error. Raises `InputError` for rows of different lengths and for
+    traced values."""
     try:
         return np.asarray(value)
+    except jax.errors.TracerArrayConversionError:
+        raise InputError(
+            f"Trials: {name} is traced; from_arrays takes arrays outside jit and vmap. Build Trials(x, q, mask) there."
+        ) from None
     except ValueError:
         words = "has rows of different lengths; give numbers, in rows of one length"
         raise InputError(f"Trials: {name} {words}.") from None

@@ -479,6 +479,11 @@ def test_a_length_scale_is_another_way_to_state_theta():
         RBF(length_scale=-1.0)
 
 
+def test_trials_of_traced_arrays_are_refused_in_a_sentence():
+    with pytest.raises(InputError, match="x is traced; from_arrays takes arrays outside jit and vmap"):
+        jax.vmap(lambda x: Trials.from_arrays(x, np.zeros(3, int)))(jnp.zeros((2, 3, 1)))
+
+
 def test_a_star_import_brings_no_modules():
     names = {}
     exec("from hilbo import *", names)

@@ -303,7 +303,7 @@ def cohort_content(
     """The content of result.json of an analysed cohort; arguments as for `result`. Nothing is written."""
     study, aggregate, seed = population.study, population.aggregate, population.seed
     analysed = {"region": population.region, "check": population.check, "highest": population.highest}
-    return result(study, aggregate, seed, truth, people, left_out, **analysed)
+    return result(study, aggregate, seed, truth, people, [*left_out, *population.doubts], **analysed)
 
 
 def write_numbers(content: Content, people: People, grid: xr.Dataset, folder: Path) -> None:

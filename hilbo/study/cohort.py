@@ -195,6 +195,7 @@ def _checked(table: pd.DataFrame, study: Study) -> TrialTable:
     back: level indices become level names, and `category` gives the response where that column is missing. If
     `read_trials` made the table and it has both, they must agree. Raises InputError."""
     text = cells_of(table)
+    _note_order(table, study.responses)
     for p in study.space.parameters:
         if p.levels and p.name in table and pd.api.types.is_numeric_dtype(table[p.name]):
             names = table[p.name].map(dict(enumerate(p.levels)))
@@ -206,6 +207,18 @@ def _checked(table: pd.DataFrame, study: Study) -> TrialTable:
     elif _CATEGORIES in table.attrs and {"response", "category"} <= set(text.columns):
         check_recoding(text, study.responses)
     return trial_table([text], study.file, source=FRAME)
+
+
+def _note_order(table: pd.DataFrame, responses: Sequence[str]) -> None:
+    """Warn if the responses are an ordered categorical whose order contradicts the study's."""
+    kind = table["response"].dtype if "response" in table else np.dtype(object)
+    if not isinstance(kind, pd.CategoricalDtype) or not kind.ordered:
+        return
+    known = [label for label in kind.categories.map(str) if label in responses]
+    if known != [label for label in responses if label in known]:
+        warn_caller(
+            f"{FRAME}: response is ordered {' < '.join(known)}; the study's order {' < '.join(responses)} is used."
+        )
 
 
 def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:

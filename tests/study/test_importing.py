@@ -2,6 +2,8 @@
 
 import json
 import os
+import tomllib
+import warnings
 
 import exported
 import numpy as np
@@ -10,6 +12,8 @@ import pytest
 from export_mutations import CHANGES, written
 
 from hilbo.errors import InputError
+from hilbo.study.cohort import cohort_of, read_trials
+from hilbo.study.config import Study
 from hilbo.study.importing.export import OpenMappingError, import_files
 from hilbo.study.importing.mapping import mapping_of, mapping_text, read_mapping
 from hilbo.study.tables.trials import trial_table
@@ -49,7 +53,7 @@ def test_an_export_gives_the_clean_table(export, tmp_path):
     made, mapping = imported(export, tmp_path, notes)
     for got, clean in zip(numbers_of(made.table), numbers_of(CLEAN[export.name]()), strict=True):
         np.testing.assert_array_equal(got, clean)
-    assert mapping_of(__import__("tomllib").loads(mapping_text(mapping)), "") == mapping
+    assert mapping_of(tomllib.loads(mapping_text(mapping)), "") == mapping
     for text in (made.table.to_csv(), json.dumps(made.record)):
         assert not [secret for secret in exported.SECRETS if secret in text]
 
@@ -116,3 +120,39 @@ def test_a_thousand_random_changes_are_never_silent(tmp_path):
     first = int(os.environ.get("HILBO_SEED", "0"))
     for seed in range(first, first + 1000):
         check_mutation(seed, tmp_path)
+
+
+# DataFrames.
+
+
+def frame_of(**changes):
+    """The clean table as a DataFrame, with changed columns."""
+    return exported.clean().assign(**changes)
+
+
+def test_an_ordered_categorical_that_contradicts_the_study_is_remarked():
+    study = Study.from_dict(tomllib.loads(exported.STUDY))
+    response = frame_of()["response"]
+    for order, warned in ((["close", "similar", "different"], True), (["different", "similar", "close"], False)):
+        frame = frame_of(response=pd.Categorical(response, order, ordered=True))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            cohort_of(frame, study)
+        assert any("the study's order different < similar < close is used" in str(w.message) for w in caught) == warned
+
+
+def test_columns_with_several_levels_are_refused():
+    frame = exported.clean()
+    frame.columns = pd.MultiIndex.from_product([["a"], frame.columns])
+    with pytest.raises(InputError, match="the columns have 2 levels"):
+        cohort_of(frame, Study.from_dict(tomllib.loads(exported.STUDY)))
+
+
+def test_a_mapping_in_python(tmp_path):
+    path = tmp_path / "export.csv"
+    exported._renamed(**exported._HEADERS)(exported.clean()).to_csv(path, index=False)
+    columns = {"participant": "Subject ID", "trial": "Trial Nr.", "response": "Rating"}
+    mapping = {"columns": columns | {"hue": "Hue (deg)", "light": "Light [%]"}}
+    study = Study.from_dict(tomllib.loads(exported.STUDY))
+    rows = read_trials(path, study, mapping=mapping)
+    np.testing.assert_array_equal(rows["hue"], exported.clean()["hue"])

@@ -135,6 +135,36 @@ def test_the_quadratic_finds_a_hill():
     np.testing.assert_allclose(probabilities[:, 0], norm.cdf(0.2 - eta), atol=0.05)
 
 
+def test_baselines_know_a_participants_earlier_responses():
+    """Against the exact predictions of a probit with a random intercept, on a fine grid of it."""
+    rng = np.random.default_rng(1)
+    people, each, sd, edge = 60, 12, 1.0, 0.3
+    person = np.repeat(np.arange(people), each)
+    shift = rng.normal(size=people) * sd
+    q = (shift[person] + rng.normal(size=people * each) > edge).astype(int)
+    known = person < people - 1
+    got = constant(q, 2, known, person)[~known]
+    grid = np.linspace(-6, 6, 2001)
+    weight, exact = norm.pdf(grid, scale=sd), []
+    for answer in q[~known]:
+        chance = norm.cdf(edge - grid)
+        exact.append(np.sum(weight * chance) / np.sum(weight))
+        weight = weight * (chance if answer == 0 else 1 - chance)
+    np.testing.assert_allclose(got[:, 0], exact, atol=0.08)
+    assert np.ptp(got[:, 0]) > 0.2
+    np.testing.assert_allclose(got[0], constant(q, 2, known)[0], rtol=1e-6)  # before the first response
+    np.testing.assert_allclose(got.sum(axis=1), 1.0, rtol=1e-12)
+
+
+def test_participants_alike_have_no_intercepts():
+    rng = np.random.default_rng(2)
+    person, x = np.repeat(np.arange(40), 10), rng.uniform(size=(400, 1))
+    q = (4 * x[:, 0] - 2 + rng.normal(size=400) > 0).astype(int)
+    known = person > 0
+    with_person, without = quadratic(x, q, 2, known, person), quadratic(x, q, 2, known)
+    assert np.abs(with_person - without).mean() < 0.03
+
+
 def test_the_quadratic_of_separated_answers_and_of_a_parameter_that_nobody_varied():
     x = np.stack([np.linspace(0, 1, 12), np.full(12, 0.5)], axis=1)
     q = (x[:, 0] > 0.5).astype(int)

@@ -22,6 +22,7 @@ from hilbo.study.analysis.best_mid_worst import Sets, best_mid_worst, second_cho
 from hilbo.study.analysis.cohort_results import CohortResults, Say, analyse_cohort
 from hilbo.study.analysis.heterogeneity import how_aggregated
 from hilbo.study.analysis.progress import Progress
+from hilbo.study.analysis.reversed_scale import reversed_sentences
 from hilbo.study.analysis.rule_comparison import FEWEST, compare
 from hilbo.study.analysis.tolerance import Ends, Tolerance, tolerance, tolerance_ends
 from hilbo.study.cohort import Cohort
@@ -178,7 +179,7 @@ def _with_learnt(population: CohortResults, seed: int, say: Say) -> CohortResult
         aggregate,
         (aggregate.alternatives | {RECOMMENDED: optimum}, aggregate.maps | {RECOMMENDED: map_}),
     )
-    return population._replace(aggregate=beside)
+    return population._replace(aggregate=beside, doubts=reversed_sentences(learns, aggregate.cohort))
 
 
 def _aggregates(both: FixedAndOptimised, own: Aggregate, seed: int) -> tuple[Aggregate, Aggregate]:

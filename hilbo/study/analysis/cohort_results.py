@@ -14,6 +14,7 @@ from hilbo.study.analysis.highest_answer import HighestAnswer, highest_answer
 from hilbo.study.analysis.model_check import model_check
 from hilbo.study.analysis.progress import Progress, follow
 from hilbo.study.analysis.region import Region, hyperparameter_draws, optimum_region
+from hilbo.study.analysis.reversed_scale import reversed_sentences
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, SayCount, aggregate_cohort, asked_variance
@@ -41,6 +42,8 @@ class CohortResults(NamedTuple):
     highest: HighestAnswer | None = None
     """A new participant's probability of the goal at the optimum; None by methods that do not
     predict it."""
+    doubts: tuple[str, ...] = ()
+    """Sentences on participants whose scale looks reversed."""
 
     @property
     def cohort(self) -> Cohort:
@@ -95,4 +98,5 @@ def analyse_cohort(
     region = optimum_region(study, aggregate.map, drawn, seed, say=count)
     highest = highest_answer(study, aggregate.map, aggregate.optimum.x, drawn)
     check = model_check(study, aggregate, count)
-    return CohortResults(study, aggregate, following, seed, region, check, highest)
+    doubts = reversed_sentences(study, cohort)
+    return CohortResults(study, aggregate, following, seed, region, check, highest, doubts)

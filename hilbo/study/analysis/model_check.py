@@ -195,8 +195,8 @@ def _densities(left: LeftOut, x: Float[np.ndarray, "n d"], categories: int) -> C
     for group in np.unique(groups):
         out = groups == group
         predicted = {
-            "constant": constant(left.q, categories, ~out),
-            "quadratic": quadratic(x, left.q, categories, ~out),
+            "constant": constant(left.q, categories, ~out, left.person),
+            "quadratic": quadratic(x, left.q, categories, ~out, left.person),
         }
         for name, chances in predicted.items():
             costs[name][out] = -np.log(chances[out, left.q[out]])

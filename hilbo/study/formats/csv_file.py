@@ -62,6 +62,8 @@ def cells_of(frame: pd.DataFrame) -> pd.DataFrame:
     another type, and for repeated or too many columns."""
     if not isinstance(frame, pd.DataFrame):
         raise InputError(f"{FRAME}: this is a {type(frame).__name__}; give a pandas DataFrame.")
+    if frame.columns.nlevels > 1:
+        raise InputError(f"{FRAME}: the columns have {frame.columns.nlevels} levels; give one name for each column.")
     check_header(list(frame.columns), FRAME)
     return _as_text(frame, 1)
 
