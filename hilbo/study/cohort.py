@@ -211,10 +211,11 @@ def _checked(table: pd.DataFrame, study: Study) -> TrialTable:
 
 def _note_order(table: pd.DataFrame, responses: Sequence[str]) -> None:
     """Warn if the responses are an ordered categorical whose order contradicts the study's."""
-    kind = table["response"].dtype if "response" in table else np.dtype(object)
-    if not isinstance(kind, pd.CategoricalDtype) or not kind.ordered:
+    kind = table["response"].dtype if "response" in table else None
+    if not (isinstance(kind, pd.CategoricalDtype) and kind.ordered):
         return
-    known = [label for label in kind.categories.map(str) if label in responses]
+    categories: list[str] = [str(label) for label in kind.categories]
+    known = [label for label in categories if label in responses]
     if known != [label for label in responses if label in known]:
         warn_caller(
             f"{FRAME}: response is ordered {' < '.join(known)}; the study's order {' < '.join(responses)} is used."
