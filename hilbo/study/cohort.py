@@ -211,10 +211,12 @@ def _checked(table: pd.DataFrame, study: Study) -> TrialTable:
 
 def _note_order(table: pd.DataFrame, responses: Sequence[str]) -> None:
     """Warn if the responses are an ordered categorical whose order contradicts the study's."""
-    kind = table["response"].dtype if "response" in table else None
-    if not (isinstance(kind, pd.CategoricalDtype) and kind.ordered):
+    if "response" not in table or not isinstance(table["response"].dtype, pd.CategoricalDtype):
         return
-    categories: list[str] = [str(label) for label in kind.categories]
+    kind = table["response"].cat
+    if not kind.ordered:
+        return
+    categories = [str(label) for label in kind.categories]
     known = [label for label in categories if label in responses]
     if known != [label for label in responses if label in known]:
         warn_caller(
