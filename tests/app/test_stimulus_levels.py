@@ -79,7 +79,7 @@ def test_another_level_voids_the_trial_and_what_is_none_is_refused(tmp_path):
             with refused(409, "it must be one of silk, wood, smooth stone."):
                 program.report("presented", values=order["values"] | {"texture": wrong})
         assert not live.events("sent") and not live.events("missed")
-        with refused(409, "texture is confirmed as wood, and silk was asked for."):
+        with refused(409, "texture is confirmed as wood, and silk was requested."):
             program.report("presented", values=order["values"] | {"texture": "wood"})
         whole = live.until(lambda v: any(t["voided"] for t in v["whole"]["trials"]), live.whole)["whole"]
         assert "texture is confirmed as wood" in next(t for t in whole["trials"] if t["voided"])["voided"]["reason"]

@@ -23,7 +23,7 @@ A = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
     [
         ("/dev/hilbo-nothing", "there is no such port; plug the device in"),
         ("socket://nowhere", "is no address; write it like"),
-        ("socket://127.0.0.1:99999", "nobody answers"),
+        ("socket://127.0.0.1:99999", "no server answers"),
         ("/dev/null", "is no serial port"),
     ],
 )
@@ -51,7 +51,7 @@ def test_without_pyserial_there_is_one_sentence(monkeypatch):
 def test_nobody_listens_at_an_address():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        with pytest.raises(InputError, match="nobody answers"):
+        with pytest.raises(InputError, match="no server answers"):
             Renderer.open(f"socket://127.0.0.1:{free.getsockname()[1]}")
 
 

@@ -96,7 +96,7 @@ def test_what_stands_in_place_of_a_map_is_said(posteriors):
             analysis._aggregated_otherwise(of_rule(rule, None))
         )
     one = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[0]), posteriors[True])  # any posterior will do
-    for rule, how in (("hierarchical", "by the rule hierarchical point by point"), ("pooled", "by bcm")):
+    for rule, how in (("hierarchical", "by the method hierarchical point by point"), ("pooled", "by bcm")):
         whole = RuleMap(rule, "exact", None, one, jnp.asarray(SHARE), jnp.asarray(1.0))
         (words,) = analysis._aggregated_otherwise(whole)
         assert how_aggregated(whole) == how and f"are aggregated {how}" in words and f"by the rule {rule} from" in words

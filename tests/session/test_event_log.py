@@ -78,7 +78,7 @@ def test_a_log_cut_anywhere_resumes_to_the_same_next_trial(tmp_path_factory, dri
     if lines and whole[cut : cut + 1] == b"\n":
         lines += 1  # its newline alone is missing
     if lines == 0:
-        with pytest.raises(InputError, match="no whole first line"):
+        with pytest.raises(InputError, match="no complete first line"):
             EventLog.resume(path, STUDY.file)
         return
     with EventLog.resume(path, STUDY.file) as log:
@@ -169,7 +169,7 @@ def test_another_study_another_writer_and_other_files_are_refused(tmp_path, driv
     EventLog.resume(path, STUDY.file).close()  # and is free again
     with pytest.raises(InputError, match="no such session was begun"):
         EventLog.resume(tmp_path / "none.jsonl", STUDY.file)
-    for content, sentence in ((b"", "no whole first line"), (b"participant,trial\n", "is damaged")):
+    for content, sentence in ((b"", "no complete first line"), (b"participant,trial\n", "is damaged")):
         path.write_bytes(content)
         with pytest.raises(InputError, match=sentence):
             read_log(path)

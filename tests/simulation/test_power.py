@@ -73,7 +73,7 @@ def test_the_page_says_how_sure_a_share_is(tmp_path):
     cost = {"preset": "paper", "material": "gel", "seconds": 1.0, "jobs": 1}
     content = write_power(study(), errors, Plan((2,), (10, 20), 5, 0), 0.25, cost, tmp_path)
     page = " ".join((tmp_path / "report.html").read_text().split())
-    assert "60 % (23 to 88)" in page and "population “paper”, material gel, were run" in page
+    assert "60 % (23 to 88)" in page and "population “paper”, material gel, were simulated" in page
     assert content["summary"][0]["reached_low"] == pytest.approx(0.2307, abs=1e-4)
     assert "2 participants: not shown by these 5 studies, up to 20 trials" in " ".join(
         (tmp_path / "report.html").read_text().split()
@@ -127,7 +127,7 @@ def test_a_rule_in_place_of_the_files_stays_with_other_numbers_of_trials(rule):
 
 
 def test_one_person_cannot_differ():
-    with pytest.raises(InputError, match="ask for 2 participants or more"):
+    with pytest.raises(InputError, match="give 2 participants or more"):
         simulate_power(dataclasses.replace(study(), rule="hierarchical"), PRESETS["paper"], Plan((1, 3), (5,), 2, 0))
 
 

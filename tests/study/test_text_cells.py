@@ -128,9 +128,9 @@ def test_words_of_a_session_are_refused_where_they_are_said():
     state = driver.state
     for act in (actions.undo, actions.abort, actions.note):
         words = {"at": 1.0, ("text" if act is actions.note else "reason"): "=1+1"}
-        with pytest.raises(RefusedError, match="would run as a formula"):
+        with pytest.raises(RefusedError, match="contains a formula for spreadsheets"):
             act(state, **words)
-    with pytest.raises(RefusedError, match="would run as a formula"):
+    with pytest.raises(RefusedError, match="contains a formula for spreadsheets"):
         actions.void(state, 1, "@SUM(A1)", 1.0)
     assert actions.note(state, "3 = 3", 1.0).data["text"] == "3 = 3"
 
