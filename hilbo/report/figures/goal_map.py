@@ -18,6 +18,7 @@ from hilbo.study.estimate.aggregate import Aggregate
 __all__ = ["goal_map"]
 
 _WIDTH, _HEIGHT = 3.2, 2.5  # inches
+_ENDS = (0.05, 0.1, 0.25, 0.5)  # of scales
 
 _Points = Float[np.ndarray, "m d"]
 
@@ -42,7 +43,7 @@ def goal_map(study: Study, aggregate: Aggregate, region: Region | None) -> Figur
     grid = plane(study, best, pair)
     label_axes(axes, study, *pair)
     image = grid.image(chances(grid.points))
-    scale = {"vmin": 0.0, "vmax": 1.0, "cmap": "cividis", "shading": "nearest", "rasterized": True}
+    scale = {"vmin": 0.0, "vmax": _scale_end(image), "cmap": "cividis", "shading": "nearest", "rasterized": True}
     bar = figure.colorbar(axes.pcolormesh(*grid.sides, image, **scale), ax=axes, label=label)
     few_ticks(bar.ax.yaxis)
     if region is not None:
@@ -51,6 +52,12 @@ def goal_map(study: Study, aggregate: Aggregate, region: Region | None) -> Figur
             axes.contour(*grid.sides, inside.astype(float), levels=[0.5], colors=[RED], linewidths=1.2)
     star(axes, study, best)
     return figure
+
+
+def _scale_end(chances: Float[np.ndarray, "r c"]) -> float:
+    """Upper end of the scale of probabilities (NaN where not feasible): 1, or less where all are small, as with many
+    responses."""
+    return next((end for end in _ENDS if np.nanmax(chances) <= end), 1.0)
 
 
 def held(region: Region, points: _Points, kernel: Stationary) -> Bool[np.ndarray, " m"]:
