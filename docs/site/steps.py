@@ -18,7 +18,7 @@ from PIL import Image
 
 __all__ = ["Step", "copied", "section", "written"]
 
-_UNSAID = r"done in|\d+ of \d+ studies|sweep \d+|(relaxation|creep) \d+ of"  # times, and progress
+_UNSAID = r"done in|\d+ of \d+ (studies|designs|maps|parts|predictions)|sweep \d+|(relaxation|creep) \d+ of"  # times, and progress
 
 
 class Step(NamedTuple):

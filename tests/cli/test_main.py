@@ -53,7 +53,7 @@ def test_aggregate_writes_everything(capsys, monkeypatch, tmp_path):
     assert data["bitrate_kbps"].attrs["units"] == "kbit/s"
     assert float(data["mean"].max()) <= content["optimum"]["mean"] + 1e-9
     page = " ".join((out / "report.html").read_text().split())
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 5
     assert "http://" not in page and "https://" not in page
     assert len(pd.read_csv(out / "optima.csv")) == 8
     assert content["rule"] == "bcm" and 0 < content["heterogeneity"]["share"] < 1

@@ -322,7 +322,7 @@ def test_a_report_of_two_materials(capsys, monkeypatch, tmp_path):
         assert "passivity" not in (out / name / "dictionary.csv").read_text()  # nothing of a renderer
         check_reserved(out / name, folder / "study.toml")
     page = " ".join((out / "report.html").read_text().split())
-    assert page.count("data:image/png;base64,") == 2 * 9 + 1 and "http://" not in page
+    assert page.count("data:image/png;base64,") == 2 * 10 + 1 and "http://" not in page
     assert "Hypothesis 4" in page and "fair, good, excellent" in page
     assert run(capsys, monkeypatch, "report", folder, "--out", out, "--force", "--exclude", "mood > 1")[0] == 2
 
