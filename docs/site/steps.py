@@ -18,7 +18,8 @@ from PIL import Image
 
 __all__ = ["Step", "copied", "section", "written"]
 
-_UNSAID = r"done in|\d+ of \d+ (studies|designs|maps|parts|predictions)|sweep \d+|(relaxation|creep) \d+ of"  # times, and progress
+# Times, and progress.
+_UNSAID = r"done in|\d+ of \d+ (studies|designs|maps|parts|predictions)|sweep \d+|(relaxation|creep) \d+ of"
 
 
 class Step(NamedTuple):
