@@ -53,6 +53,8 @@ def imports(
         where = beside["mapping.toml"]
         write_new(where, mapping_text(error.mapping), force)
         raise InputError(f"{error} The rest is in {where}: complete it, then add --mapping {where}.") from None
+    if force and not made.ids:  # the list of an earlier import would be of other ids
+        beside["ids.csv"].unlink(missing_ok=True)
     if made.ids:
         rows = [["participant", "id_in_export"], *([new, old] for old, new in made.ids.items())]
         write_new(beside["ids.csv"], csv_text(rows), force)

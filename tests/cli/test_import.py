@@ -50,7 +50,7 @@ def test_an_incomplete_mapping_is_completed_by_hand(folder, capsys, monkeypatch)
     assert code == 0 and "an export of Qualtrics; 7 rows read, 48 trials" in said
     record = json.loads((folder / "trials.import.json").read_text())
     assert record["columns_personal"] == ["IPAddress", "RecipientEmail"]
-    assert record["rows_left_out"] == {"not a trial": 1}
+    assert record["rows_left_out"] == {"without a value of a parameter, or excluded by [rows]": 1}
 
 
 def test_nothing_is_overwritten(folder, capsys, monkeypatch):
@@ -70,7 +70,7 @@ def test_nothing_is_overwritten(folder, capsys, monkeypatch):
         ('participant,response,hue,light\nA,"close" one,150,40', "export.csv:2: has a quotation mark"),
         ("participant,response,hue,light\nA,close,999,40", "export.csv:2: hue is"),
         ("participant,response,hue,light\nA,nearly,150,40", 'response "nearly": write in [responses]'),
-        ("participant,response,hue,light\n,close,150,40", "export.csv:2: participant is empty"),
+        ("participant,response,hue,light\n,close,150,40", 'export.csv:2: participant is ""; each trial needs one'),
         ("participant;response;hue;light\nA;close;150,5;40.5", "decimal commas and points"),
     ],
 )
@@ -94,3 +94,11 @@ def test_a_wrong_mapping_is_said_in_a_sentence(folder, capsys, monkeypatch, line
     (folder / "m.toml").write_text(line)
     code, _, said = run(capsys, monkeypatch, "import", path, "--study", "study.toml", "--mapping", "m.toml")
     assert code == 2 and "m.toml: " in said and sentence in said
+
+
+def test_a_list_of_earlier_ids_goes_with_its_table(folder, capsys, monkeypatch):
+    _, path = export_of("ids of Prolific", folder)
+    assert run(capsys, monkeypatch, "import", path, "--study", "study.toml")[0] == 0
+    _, path = export_of("clean", folder)
+    assert run(capsys, monkeypatch, "import", path, "--study", "study.toml", "--force")[0] == 0
+    assert not (folder / "trials.ids.csv").exists()

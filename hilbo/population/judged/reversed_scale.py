@@ -37,7 +37,8 @@ def reversed_people(gp: OrdinalGP, trials: Trials, share: Float[Array, ""]) -> d
     """
     answered = np.any(np.asarray(trials.mask), axis=1, keepdims=False)
     limit = _LIMIT + np.log(answered.sum() / _LIMIT_PEOPLE)
-    return dict(_above(gp, trials, share, answered, limit)) if answered.sum() > 2 else {}
+    named = _above(gp, trials, share, answered, limit) if answered.sum() > 2 else ()
+    return dict(sorted(named, key=lambda each: -each[1]))
 
 
 def _above(
@@ -46,8 +47,9 @@ def _above(
     """Yield row and factor of the participant with the largest factor above the limit, each left out of the map for the
     next; at most half of the participants."""
     known = answered.copy()
-    while 2 * known.sum() > answered.sum():
-        factors = np.where(known, log_factors(gp, trials, share, known), -np.inf)
+    while 2 * (answered.sum() - known.sum() + 1) <= answered.sum():
+        factors = log_factors(gp, trials, share, known)
+        factors = np.where(known & np.isfinite(factors), factors, -np.inf)  # a fit that failed says nothing
         row = int(np.argmax(factors))
         if not factors[row] > limit:
             return

@@ -2,7 +2,8 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Mapping as MappingLike
 from decimal import Decimal, InvalidOperation
 from typing import NamedTuple
 
@@ -11,21 +12,23 @@ import pandas as pd
 from hilbo.errors import InputError
 from hilbo.search.box import Parameter
 from hilbo.study.file.reading import StudyFile
-from hilbo.study.formats.cell_text import id_form, is_decimal
+from hilbo.study.formats.cell_text import is_decimal
 from hilbo.study.formats.csv_file import answer_forms, place, refuse
 from hilbo.study.formats.json_file import Content
 from hilbo.study.importing.answers import clean, is_missing, plain, told_missing
+from hilbo.study.importing.checks import check_mapping, numeric_names
 from hilbo.study.importing.mapping import FILE, Mapping
+from hilbo.study.importing.participants import finished, new_ids
 from hilbo.study.importing.patterns import STIMULUS
 from hilbo.study.importing.raw import RawTable
 from hilbo.study.importing.record import Counts, record_of, sentences_of
-from hilbo.study.importing.rows import check_columns, long_rows, numeric_names, trial_rows
-from hilbo.study.tables.remarks import note_forms
+from hilbo.study.importing.rows import long_rows, trial_rows
 from hilbo.study.tables.trials import NothingToFitError, trial_table
 
 __all__ = ["Imported", "converted"]
 
 _NOT_GIVEN = "missing response"
+_NO_TRIAL = "without a value of a parameter, or excluded by [rows]"
 _GIVE_ID = "each trial needs one, so add it or delete the row"
 
 
@@ -53,14 +56,14 @@ def converted(
     parts, counts = [], Counts()
     for raw in tables:
         cells = raw.cells.iloc[mapping.header_rows - 1 :]
-        check_columns(cells, mapping, study, source)
+        check_mapping(mapping, cells.columns, study, source)
         counts.rows += len(cells)
         trials = trial_rows(cells, mapping, study)
-        counts.left_out["not a trial"] += len(cells) - len(trials)
+        counts.left_out[_NO_TRIAL] += len(cells) - len(trials)
         part = long_rows(trials, mapping, study)
         if mapping.columns["participant"] == FILE:
             part["participant"] = _stem(raw.source)
-        refuse(part["participant"].map(is_missing), raw.source, lambda row: f"participant is empty; {_GIVE_ID}.")
+        _check_participants(part, raw.source)
         part, kept = _with_answers(part, mapping, study, raw.source)
         absent = part[~kept]
         counts.missing += Counter(clean(cell) for cell in absent["response"])
@@ -68,12 +71,11 @@ def converted(
         counts.left_out[_NOT_GIVEN] += len(absent)
         parts.append((raw.source, _with_numbers(part[kept].copy(), mapping, study, raw.source)))
     names = list(dict.fromkeys(name for _, part in parts for name in part["participant"]))
-    note_forms(names, parts[0][0], note)
-    ids = _ids(names, mapping)
-    texts = [_finished(part, mapping, study, ids, file) for file, part in parts]
+    ids = new_ids(names, mapping, parts[0][0], note)
+    texts = finished(parts, mapping, study, ids)
     _check([(file, part) for (file, _), part in zip(parts, texts, strict=True)], study, note)
     table = pd.concat(texts, ignore_index=True)
-    record = record_of(tables, mapping, study.hash, table, ids, counts)
+    record = record_of(tables, mapping, study, table, ids, counts)
     return Imported(table, ids, record, sentences_of(record, counts.people))
 
 
@@ -92,31 +94,41 @@ def _with_answers(
     not name. Raises `InputError` for a cell that is no response."""
     marks = {plain(cell) for cell in mapping.missing}
     meant = {plain(cell): label for cell, label in mapping.responses.items()}
-    exact = {plain(form): form for form in answer_forms(study.responses)[0]} if not _from_zero(mapping, study) else {}
+    exact = {plain(form): form for form in _forms(mapping, study)}
     kept_marks = {plain(cell): cell for cell in study.missing}
     answers, stays = [], []
     for row, cell in zip(part.index, part["response"], strict=True):
-        form = plain(cell)
-        whole = re.sub(r"(?<=\d)[.,]0+$", "", form)
-        label = meant.get(form) or meant.get(whole) or exact.get(form) or exact.get(whole)
-        absent = label is None and told_missing(cell, marks | kept_marks.keys())
+        forms = (plain(cell), re.sub(r"(?<=\d)[.,]0+$", "", plain(cell)))
+        absent = told_missing(cell, marks | kept_marks.keys())
+        label = _first(meant, forms) or (None if absent else _first(exact, forms))
+        kept = _first(kept_marks, forms)
         if label is None and not absent:
             raise InputError(
                 f'{place(source, row)}response is "{cell}"; write in [responses] of the mapping what it means, or add'
                 " it to missing."
             )
-        if label is not None and label not in study.responses and label not in exact.values():
-            raise InputError(
-                f'[responses] of the mapping has "{label}", which is no response of the study; correct it.'
-            )
-        answers.append(label if label is not None else kept_marks.get(form, cell))
-        stays.append(not absent or form in kept_marks)
+        answers.append(label or kept or cell)
+        stays.append(label is not None or kept is not None)
     return part.assign(response=answers), pd.Series(stays, part.index, dtype=bool)
 
 
-def _from_zero(mapping: Mapping, study: StudyFile) -> bool:
-    """Whether the mapping reads ranks from 0, so that a rank that it does not name is no response."""
-    return mapping.responses.get("0") == study.responses[0]
+def _first(known: MappingLike[str, str], forms: Sequence[str]) -> str | None:
+    """The entry of the first of these forms that has one; None if none has."""
+    return next((known[form] for form in forms if form in known), None)
+
+
+def _forms(mapping: Mapping, study: StudyFile) -> Iterable[str]:
+    """Cells that are responses without an entry in the mapping: labels and ranks from 1; labels only if the mapping has
+    an entry for a number that means another rank."""
+    ranks = {str(rank): label for rank, label in enumerate(study.responses, 1)}
+    other = any(cell in map(str, range(100)) and ranks.get(cell) != label for cell, label in mapping.responses.items())
+    return study.responses if other else answer_forms(study.responses)[0]
+
+
+def _check_participants(part: pd.DataFrame, source: str) -> None:
+    """Raise `InputError` for a row whose participant is empty or a mark of a missing value."""
+    names = part["participant"]
+    refuse(names.map(is_missing), source, lambda row: f'participant is "{part.at[row, "participant"]}"; {_GIVE_ID}.')
 
 
 def _with_numbers(part: pd.DataFrame, mapping: Mapping, study: StudyFile, source: str) -> pd.DataFrame:
@@ -160,65 +172,38 @@ def _check_marks(part: pd.DataFrame, names: Sequence[str], mapping: Mapping, sou
 def _value(cell: str, parameter: Parameter, mapping: Mapping, where: str) -> str:
     """A parameter's cell as the text of a number in the study's unit, or as a level's name. Raises `InputError`."""
     if parameter.levels:
-        return mapping.levels.get(parameter.name, {}).get(cell) or cell
+        return mapping.levels.get(parameter.name, {}).get(cell, cell)
     text = cell.removesuffix(parameter.unit).rstrip() if parameter.unit else cell
     text = text.replace(",", ".") if mapping.decimal == "," else text
     factor = mapping.factors.get(parameter.name, 1.0)
     if factor == 1.0:
         return text
     try:
-        return str(float(Decimal(text) * Decimal(repr(factor))))
+        return str(float(Decimal(text) * Decimal(repr(factor)) if "_" not in text else Decimal("no number")))
     except InvalidOperation as error:
         raise InputError(f'{where}{parameter.name} is "{cell}"; it must be a number.') from error
 
 
-# Participants and trials.
-
-
-def _ids(names: Sequence[str], mapping: Mapping) -> dict[str, str]:
-    """Id in the export -> id in the table, for ids that are not as written; codes are P001, P002, … in the order of the
-    table."""
-    if mapping.ids == "as written":
-        return {}
-    if mapping.ids == "normal":
-        return {name: re.sub(r"(?<=\d)[.,]0+$", "", id_form(name)) for name in names}
-    width = max(3, len(str(len(names))))
-    return {name: f"P{number:0{width}d}" for number, name in enumerate(names, 1)}
-
-
-def _finished(part: pd.DataFrame, mapping: Mapping, study: StudyFile, ids: dict[str, str], source: str) -> pd.DataFrame:
-    """The columns of a trial table, in their order, with the ids and the numbers of trials. Raises `InputError`."""
-    if ids:
-        part = part.assign(participant=part["participant"].map(ids))
-    if "trial" in part:
-        part = part.assign(trial=[_trial(cell, mapping, place(source, row)) for row, cell in part["trial"].items()])
-    else:
-        order = part.groupby(["participant", *({"session", "material"} & set(part.columns))]).cumcount() + 1
-        part = part.assign(trial=order.astype(str))
-    names = ["participant", "trial", "response", *(p.name for p in study.space.parameters)]
-    more = [name for name in part.columns if name not in (*names, STIMULUS)]
-    return part[[*names, *more]]
-
-
-def _trial(cell: str, mapping: Mapping, where: str) -> str:
-    """A trial's number, counted from 1. Raises `InputError`."""
-    if not re.fullmatch(r"\d+([.,]0+)?", cell):
-        raise InputError(f'{where}trial is "{cell}"; it must be a whole number.')
-    return str(int(re.split("[.,]", cell)[0]) + 1 - mapping.trials_from)
+# The whole table.
 
 
 def _check(parts: Sequence[tuple[str, pd.DataFrame]], study: StudyFile, note: Callable[[str], object]) -> None:
     """Check the rows of each file as a trial table is checked, so that mistakes are named with its line; and those of
     several files together. Raises `InputError`."""
     groups = [(source, [part]) for source, part in parts]
+    listed = f"it must be one of {', '.join(study.materials)}"
     if len(parts) > 1:
         groups.append(("the table", [_numbered(pd.concat([part for _, part in parts]))]))
-    for place_of_group, (source, pieces) in enumerate(groups, 1):
-        said = note if place_of_group == len(groups) else _silent
-        for material in study.materials or (None,):
-            named = material is None or any((piece.get("material") == material).any() for piece in pieces)
-            if named:
-                _check_one(pieces, study if material is None else study.material(material), material, source, said)
+    for number, (source, pieces) in enumerate(groups, 1):
+        said = note if number == len(groups) else _silent
+        if not study.materials:
+            _check_one(pieces, study, None, source, said)
+        for piece in pieces if study.materials else ():
+            unknown = ~piece["material"].isin(study.materials)
+            refuse(unknown, source, lambda row, piece=piece: f'material is "{piece.at[row, "material"]}"; {listed}.')
+        for material in study.materials:
+            if any((piece["material"] == material).any() for piece in pieces):
+                _check_one(pieces, study.material(material), material, source, said)
 
 
 def _silent(sentence: str) -> None:

@@ -3,8 +3,6 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import pandas as pd
-
 from hilbo.errors import InputError, warn_caller
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.importing.convert import Imported, converted
@@ -41,9 +39,7 @@ def import_files(
     for sentence in (sentence for table in tables for sentence in table.notes):
         note(sentence)
     if mapping is None:
-        columns = list(dict.fromkeys(name for table in tables for name in table.cells.columns))
-        cells = [table.cells.reindex(columns=columns, fill_value="") for table in tables]
-        proposal = propose(pd.concat(cells, ignore_index=True), study, len(paths))
+        proposal = propose([table.cells for table in tables], study)
         mapping = proposal.mapping
         if proposal.questions:
             raise OpenMappingError(f"{paths[0]}: {' Besides, '.join(proposal.questions)}", mapping)

@@ -8,7 +8,7 @@ tables with one row a participant: `Q{trial}` or `Q{stimulus}` names a column fo
 import json
 from collections.abc import Mapping as MappingLike
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -20,7 +20,8 @@ __all__ = ["FILE", "Ids", "Mapping", "mapping_of", "mapping_text", "read_mapping
 
 FILE = "{file}"
 """In place of a column: the name of the file, for exports with one file a participant."""
-Ids = Literal["as written", "normal", "code"]
+Ids = Literal["", "as written", "normal", "code"]
+"""How ids are made; "" is by what they look like."""
 _LINES = {
     "tool": "program that wrote the table, as recognised",
     "header_rows": "rows before the first row of data; the first one has the names of the columns",
@@ -44,8 +45,8 @@ class Mapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     columns: dict[str, str]
     schema: Literal[1] = 1
     tool: str = ""
-    header_rows: int = 1
-    ids: Ids = "as written"
+    header_rows: Annotated[int, msgspec.Meta(ge=1)] = 1
+    ids: Ids = ""
     trials_from: int = 1
     decimal: Literal[".", ","] = "."
     missing: tuple[str, ...] = ()

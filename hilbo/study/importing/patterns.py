@@ -6,16 +6,21 @@ from collections.abc import Iterable, Sequence
 from hilbo.errors import InputError
 from hilbo.study.importing.mapping import FILE
 
-__all__ = ["STIMULUS", "TRIAL", "filled", "is_pattern", "matches", "runs_of_digits"]
+__all__ = ["STIMULUS", "TRIAL", "braces", "filled", "is_pattern", "matches", "runs_of_digits"]
 
 TRIAL, STIMULUS = "trial", "stimulus"
-_BRACES = re.compile(r"\{(\w+)\}")
+_BRACES = re.compile(r"\{([^\W\d]\w*)\}")
 _NUMBER = r"-?\d+(?:[.,]\d+)?"
 
 
-def is_pattern(column: str) -> bool:
-    """Whether a column of a mapping is a pattern."""
-    return column != FILE and _BRACES.search(column) is not None
+def is_pattern(column: str, columns: Iterable[str]) -> bool:
+    """Whether a column of a mapping is a pattern: it has a name in braces, and is none of the table's `columns`."""
+    return column != FILE and _BRACES.search(column) is not None and column not in set(columns)
+
+
+def braces(pattern: str) -> list[str]:
+    """The names in braces of a pattern."""
+    return _BRACES.findall(pattern)
 
 
 def matches(pattern: str, names: Iterable[str], numeric: Sequence[str]) -> dict[str, dict[str, str]]:

@@ -7,7 +7,6 @@ can name it. Every mistake is one sentence with the file.
 import datetime
 import io
 import json
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -98,13 +97,15 @@ def _fitted(row: Sequence[str], length: int, source: str, line: int) -> list[str
 def _distinct(names: Sequence[str]) -> tuple[list[str], str]:
     """Names made distinct, "x (2)" for the second "x" and "column 3" for an empty third one; and the first repeated
     name, or ""."""
-    counts: Counter[str] = Counter()
-    given, repeated = [], ""
+    given: list[str] = []
+    repeated, taken = "", {name for name in names if name}
     for number, name in enumerate(names, 1):
         name = name or f"column {number}"
-        counts[name] += 1
-        repeated = repeated or (name if counts[name] > 1 else "")
-        given.append(name if counts[name] == 1 else f"{name} ({counts[name]})")
+        called, again = name, 1
+        while called in given or (again > 1 and called in taken):
+            called, again = f"{name} ({again + 1})", again + 1
+        repeated = repeated or (name if again > 1 else "")
+        given.append(called)
     return given, repeated
 
 

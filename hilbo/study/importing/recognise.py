@@ -13,12 +13,13 @@ from msgspec.structs import replace
 from hilbo.search.box import Parameter
 from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.cell_text import is_decimal
-from hilbo.study.importing.answers import answers_of, clean, is_missing, is_personal_id, levels_of
-from hilbo.study.importing.mapping import FILE, Ids, Mapping
+from hilbo.study.importing.answers import answers_of, clean, is_absent, is_missing, levels_of
+from hilbo.study.importing.mapping import FILE, Mapping
+from hilbo.study.importing.participants import ids_by_default
 from hilbo.study.importing.patterns import STIMULUS, filled, is_pattern, matches, runs_of_digits
 from hilbo.study.importing.patterns import TRIAL as TRIAL_KEY
-from hilbo.study.importing.rows import trial_rows
-from hilbo.study.importing.tools import PARTICIPANT, RESPONSE, TRIAL, Tool, key, named, tool_of
+from hilbo.study.importing.rows import trial_rows, with_values
+from hilbo.study.importing.tools import PARTICIPANT, RESPONSE, TRIAL, Tool, key, named, other_unit, tool_of
 
 __all__ = ["Proposal", "propose"]
 
@@ -44,15 +45,15 @@ class _Seen(NamedTuple):
     tool: Tool
 
 
-def propose(cells: pd.DataFrame, study: StudyFile, files: int = 1) -> Proposal:
-    """Propose a mapping for an export. `cells`: all rows as text, further header rows included; `files`: the number of
-    files that they come from."""
-    columns = list(cells.columns)
-    tool = tool_of(columns)
-    header_rows = tool.header_rows + 2 * bool(len(cells) > 1 and (cells.iloc[1].str.startswith(_IMPORT_ID)).any())
-    seen = _Seen(columns, cells.iloc[header_rows - 1 :], tool)
+def propose(files: Sequence[pd.DataFrame], study: StudyFile) -> Proposal:
+    """Propose a mapping for an export. `files`: the rows of each file as text, further header rows included."""
+    columns = list(dict.fromkeys(name for cells in files for name in cells.columns))
+    tool, first = tool_of(columns), files[0]
+    header_rows = tool.header_rows + 2 * bool(len(first) > 1 and (first.iloc[1].str.startswith(_IMPORT_ID)).any())
+    rows = [cells.reindex(columns=columns, fill_value="").iloc[header_rows - 1 :] for cells in files]
+    seen = _Seen(columns, pd.concat(rows, ignore_index=True), tool)
     questions: list[str] = []
-    chosen = {"participant": _participant(seen, files, questions)}
+    chosen = {"participant": _participant(seen, len(files), questions)}
     chosen |= _trials(seen, study, chosen["participant"], questions)
     more = (*_OWN, study.random_effect or "")
     chosen |= {name: name for name in more if name in columns and name not in chosen}
@@ -79,8 +80,10 @@ def _participant(seen: _Seen, files: int, questions: list[str]) -> str:
     """The column of the participant, or `FILE`; "" with a question if there is none."""
     hits = named(seen.columns, PARTICIPANT[:1]) or named(seen.columns, seen.tool.participant)
     hits = hits or named(seen.columns, PARTICIPANT)
+    if len(hits) > 1:
+        questions.append(_which("participant", hits, seen.columns))
     if hits:
-        return hits[0]
+        return hits[0] if len(hits) == 1 else ""
     if files > 1:
         return FILE
     questions.append(f"no column is known to name the participant ({_some(seen.columns)}): write it in [columns].")
@@ -92,8 +95,8 @@ def _trials(seen: _Seen, study: StudyFile, participant: str, questions: list[str
     each participant. Adds questions for missing items."""
     by_name = {p.name: _parameter(seen, p) for p in study.space.parameters}
     given = [column for columns in by_name.values() for column in columns]
-    if given:  # other rows may have answers to other questions
-        seen = seen._replace(cells=seen.cells[~seen.cells[given].map(is_missing).all(axis=1)])
+    levels = {column: p.levels for p in study.space.parameters for column in by_name[p.name]}
+    seen = seen._replace(cells=with_values(seen.cells, levels))  # other rows may have answers to other questions
     trial = [column for column in named(seen.columns, TRIAL) if _are_whole(seen.cells[column])]
     taken = {participant, *given, *trial}
     hits = [] if _with_parameters(seen.columns, study) else _responses(seen, study, taken)
@@ -137,7 +140,8 @@ def _some(names: Sequence[str]) -> str:
 
 def _parameter(seen: _Seen, parameter: Parameter) -> list[str]:
     """Columns that may contain a parameter, by their name."""
-    return named(seen.columns, (parameter.name,), parameter.unit)
+    hits = named(seen.columns, (parameter.name,), parameter.unit)
+    return [column for column in hits if column == parameter.name or not other_unit(column, parameter.unit)]
 
 
 def _are_whole(cells: pd.Series) -> bool:
@@ -198,17 +202,16 @@ def _is_empty(seen: _Seen, column: str) -> bool:
 
 def _with_parameters(columns: Sequence[str], study: StudyFile) -> str:
     """The pattern of columns that have every parameter's name and number in their names, such as
-    "hue{hue}_light{light}"; "" if there are none."""
-    for column in columns:
-        pattern = column
-        for p in study.space.parameters:
-            pattern = re.sub(rf"(?i)({re.escape(p.name)}[ _=:-]*)-?\d+([.,]\d+)?", rf"\1{{{p.name}}}", pattern, count=1)
-        if (
-            pattern.count("{") == len(study.space.parameters)
-            and len(matches(pattern, columns, [p.name for p in study.space.parameters])) > 1
-        ):
-            return pattern
-    return ""
+    "hue{hue}_light{light}"; "" if there are none, or if a sign before a number may be a separator."""
+    numeric = [p.name for p in study.space.parameters]
+    every = [c for c in columns if all(re.search(rf"(?i){re.escape(name)}[ _=:-]*\d", c) for name in numeric)]
+    pattern = every[0] if len(every) > 1 else ""
+    for p in study.space.parameters:
+        sign, name = ("-?" if p.low < 0 else ""), re.escape(p.name)
+        if p.low < 0 and any(re.search(rf"(?i){name}-\d", column) for column in every):
+            return ""
+        pattern = re.sub(rf"(?i)({name}[ _=:-]*?){sign}\d+([.,]\d+)?", rf"\1{{{p.name}}}", pattern, count=1)
+    return pattern if len(matches(pattern, every, numeric)) == len(every) > 1 else ""
 
 
 def _wide_parameters(seen: _Seen, study: StudyFile, wide: dict[str, list[str]], questions: list[str]) -> dict[str, str]:
@@ -243,6 +246,10 @@ def _cells_of(mapping: Mapping, seen: _Seen, study: StudyFile, questions: list[s
     if asked := _texts(mapping, cells, "response", study):
         answers = answers_of(asked, study.responses, seen.tool.counts_from_zero)
         unknown = {cell: "" for cell in answers.unknown}
+        if doubtful := [cell for cell, label in answers.labels.items() if not label]:
+            questions.append(
+                f"response {_some(doubtful)} may count from 0 or from 1: write in [responses] what each means."
+            )
         if unknown:
             questions.append(
                 f"response {_some(answers.unknown)}: write in [responses] what each means, or add it to missing."
@@ -260,7 +267,10 @@ def _cells_of(mapping: Mapping, seen: _Seen, study: StudyFile, questions: list[s
     numbers = [clean(cell) for name in numeric for cell in _texts(mapping, cells, name, study)]
     return replace(
         mapping,
-        ids=_ids(_texts(mapping, cells, "participant", study)),
+        ids=ids_by_default(
+            [clean(text) for text in _texts(mapping, cells, "participant", study) if clean(text)],
+            mapping.columns["participant"],
+        ),
         decimal=_decimal(numbers, questions),
         trials_from=0
         if "0" in {re.sub(r"[.,]0+$", "", clean(t)) for t in _texts(mapping, cells, "trial", study)}
@@ -272,19 +282,11 @@ def _cells_of(mapping: Mapping, seen: _Seen, study: StudyFile, questions: list[s
 def _texts(mapping: Mapping, cells: pd.DataFrame, name: str, study: StudyFile) -> list[str]:
     """The different cells of a mapping's column, or of all columns that its pattern matches; [] without a column."""
     column = mapping.columns.get(name, "")
-    if is_pattern(column):
+    if is_pattern(column, cells.columns):
         columns = list(matches(column, cells.columns, [p.name for p in study.space.parameters if not p.levels]))
     else:
         columns = [column] if column in cells.columns else []
     return list(dict.fromkeys(cell for column in columns for cell in cells[column].unique()))
-
-
-def _ids(ids: Sequence[str]) -> Ids:
-    """How ids are made: new ones if any could be traced to a person, without ".0" if all are such numbers."""
-    given = [clean(text) for text in ids if clean(text)]
-    if any(map(is_personal_id, given)):
-        return "code"
-    return "normal" if given and all(re.fullmatch(r"\d+[.,]0", text) for text in given) else "as written"
 
 
 def _decimal(numbers: Sequence[str], questions: list[str]) -> Literal[".", ","]:
@@ -305,7 +307,7 @@ def _stimuli(mapping: Mapping, cells: pd.DataFrame, study: StudyFile) -> dict[st
     if f"{{{STIMULUS}}}" in column:
         names = [match[STIMULUS] for match in matches(column, cells.columns, ()).values()]
     elif STIMULUS in mapping.columns:
-        names = [clean(cell) for cell in cells[mapping.columns[STIMULUS]].unique() if not is_missing(cell)]
+        names = [clean(cell) for cell in cells[mapping.columns[STIMULUS]].unique() if not is_absent(cell)]
     else:
         return {}
-    return {name: {p.name: p.levels[0] if p.levels else "" for p in study.space.parameters} for name in names}
+    return {name: {p.name: "" for p in study.space.parameters} for name in names}

@@ -7,8 +7,12 @@ from dataclasses import dataclass, field
 
 import pandas as pd
 
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.json_file import Content
+from hilbo.study.importing.answers import is_missing, is_traceable
+from hilbo.study.importing.checks import numeric_names
 from hilbo.study.importing.mapping import Mapping
+from hilbo.study.importing.patterns import is_pattern, matches
 from hilbo.study.importing.raw import RawTable
 from hilbo.study.importing.tools import personal
 
@@ -32,19 +36,21 @@ class Counts:
 def record_of(
     tables: Sequence[RawTable],
     mapping: Mapping,
-    study: str,
+    study: StudyFile,
     table: pd.DataFrame,
     ids: MappingLike[str, str],
     counts: Counts,
 ) -> Content:
-    """Actions taken, without ids and names of files: counts, columns, conversions. `study`: hash of the study file,
-    `table`: the trial table, `ids`: id in the export -> id in the table."""
+    """Actions taken, without ids, names of files, and texts that are no usual mark of a missing response: counts,
+    columns, conversions. `table`: the trial table, `ids`: id in the export -> id in the table."""
     columns = dict.fromkeys(name for raw in tables for name in raw.cells.columns)
-    used = {*mapping.columns.values(), *mapping.keep, *mapping.rows}
-    left = [name for name in columns if name not in used]
+    used = {*mapping.keep, *mapping.rows}
+    for column in mapping.columns.values():
+        used |= {*matches(column, columns, numeric_names(study))} if is_pattern(column, columns) else {column}
+    left = [_shown(name) for name in columns if name not in used]
     return {
         "schema": 1,
-        "study": study,
+        "study": study.hash,
         "files": len(tables),
         "read_as": [sentence.removeprefix(f"{raw.source}: ") for raw in tables for sentence in raw.notes],
         "tool": mapping.tool,
@@ -52,10 +58,10 @@ def record_of(
         "trials": len(table),
         "participants": int(table["participant"].nunique()),
         "rows_left_out": {reason: count for reason, count in counts.left_out.items() if count},
-        "missing": dict(counts.missing),
+        "missing": dict(_by_mark(counts.missing)),
         "missing_by_participant": sorted(counts.people.values(), reverse=True),
         "responses": dict(mapping.responses),
-        "ids": mapping.ids,
+        "ids": mapping.ids or ("code" if ids else "as written"),
         "ids_changed": sum(old != new for old, new in ids.items()),
         "trials_numbered": "trial" not in mapping.columns,
         "trials_from": mapping.trials_from,
@@ -64,6 +70,20 @@ def record_of(
         "columns_left_out": left,
         "columns_personal": personal(left),
     }
+
+
+def _shown(column: str) -> str:
+    """A column's name without what could be traced to a participant, as JSON with ids as keys has."""
+    return "…" if "@" in column else ".".join("…" if is_traceable(part) else part for part in column.split("."))
+
+
+def _by_mark(missing: "Counter[str]") -> "Counter[str]":
+    """Counts of missing responses by their usual marks; any other text, which a participant may have written, counts
+    as "other"."""
+    counts: Counter[str] = Counter()
+    for cell, count in missing.items():
+        counts[cell if is_missing(cell) else "other"] += count
+    return counts
 
 
 def sentences_of(record: Content, people: Counter[str]) -> list[str]:

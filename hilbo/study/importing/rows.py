@@ -1,20 +1,19 @@
 """Rows of an export as rows of trials: conditions of the mapping, and tables with one row for each participant turned
 into one row for each trial. Loads no JAX."""
 
+from collections.abc import Collection
+from collections.abc import Mapping as MappingLike
+
 import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.study.file.reading import StudyFile
-from hilbo.study.importing.answers import clean, is_missing, plain
+from hilbo.study.importing.answers import clean, is_absent, plain
+from hilbo.study.importing.checks import numeric_names
 from hilbo.study.importing.mapping import FILE, Mapping
 from hilbo.study.importing.patterns import STIMULUS, TRIAL, filled, is_pattern, matches
 
-__all__ = ["check_columns", "long_rows", "numeric_names", "trial_rows"]
-
-
-def numeric_names(study: StudyFile) -> list[str]:
-    """Names of the parameters that are numbers."""
-    return [p.name for p in study.space.parameters if not p.levels]
+__all__ = ["long_rows", "trial_rows", "with_values"]
 
 
 def trial_rows(cells: pd.DataFrame, mapping: Mapping, study: StudyFile) -> pd.DataFrame:
@@ -24,39 +23,25 @@ def trial_rows(cells: pd.DataFrame, mapping: Mapping, study: StudyFile) -> pd.Da
     for column, kept in mapping.rows.items():
         forms = {plain(cell) for cell in kept}
         cells = cells[cells[column].map(plain).isin(forms)]
-    names = (*(p.name for p in study.space.parameters), STIMULUS)
-    given = [column for name in names if (column := mapping.columns.get(name, "")) in cells.columns and column]
-    return cells[~cells[given].map(is_missing).all(axis=1)] if given else cells
+    levels = {p.name: p.levels for p in study.space.parameters} | {STIMULUS: tuple(mapping.stimuli)}
+    given = {column: levels[name] for name in levels if (column := mapping.columns.get(name, "")) in cells.columns}
+    return with_values(cells, given)
 
 
-def check_columns(cells: pd.DataFrame, mapping: Mapping, study: StudyFile, source: str) -> None:
-    """Raise `InputError` unless the mapping has a column, a pattern or stimuli for all that a trial table needs, and
-    the columns that it names are in the table. `source`: the mapping, for messages."""
-    parameters = [p.name for p in study.space.parameters]
-    known = {"participant", "trial", "response", STIMULUS, "session", "phase", "material", "voided", "unblinded"}
-    for name, column in mapping.columns.items():
-        if name not in (*known, *parameters, study.random_effect):
-            raise InputError(f"{source}: columns.{name} is no column of a trial table; copy others with keep.")
-        present = bool(matches(column, cells.columns, numeric_names(study))) if is_pattern(column) else column in cells
-        if not present and column != FILE:
-            words = f'"{column}", which is not in the table' if column else "empty"
-            raise InputError(f"{source}: columns.{name} is {words}; write the name of a column.")
-    braced = set(parameters) & {
-        name for column in mapping.columns.values() for name in parameters if f"{{{name}}}" in column
-    }
-    by_stimulus = STIMULUS in mapping.columns or f"{{{STIMULUS}}}" in mapping.columns.get("response", "")
-    for name in ("participant", "response", *([] if by_stimulus else parameters)):
-        if name not in mapping.columns and name not in braced:
-            raise InputError(f"{source}: columns.{name} is missing; write the name of its column.")
-    if absent := [column for column in (*mapping.rows, *mapping.keep) if column not in cells]:
-        raise InputError(f'{source}: column "{absent[0]}" of rows or keep is not in the table; correct its name.')
+def with_values(cells: pd.DataFrame, columns: MappingLike[str, Collection[str]]) -> pd.DataFrame:
+    """The rows that have a value in some of the columns, all rows if there are none. `columns`: column -> cells that
+    are values even where they look like a missing one."""
+    if not columns:
+        return cells
+    absent = [cells[column].map(lambda cell, kept=kept: is_absent(cell, kept)) for column, kept in columns.items()]
+    return cells[~pd.concat(absent, axis=1).all(axis=1)]
 
 
 def long_rows(cells: pd.DataFrame, mapping: Mapping, study: StudyFile) -> pd.DataFrame:
     """One row for each trial, with the columns of the trial table that the mapping has, `stimulus`, and those of keep;
     the index (line of the export) is repeated for trials of one line. Cells are as they stand."""
     columns, numeric = dict(mapping.columns), numeric_names(study)
-    wide = {name: column for name, column in columns.items() if is_pattern(column)}
+    wide = {name: column for name, column in columns.items() if is_pattern(column, cells.columns)}
     fixed = {name: cells[column].map(clean) for name, column in columns.items() if name not in wide and column != FILE}
     fixed |= {name: cells[name] for name in mapping.keep}
     if not wide:

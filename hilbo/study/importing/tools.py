@@ -6,7 +6,7 @@ import unicodedata
 from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
-__all__ = ["PARTICIPANT", "RESPONSE", "TRIAL", "Tool", "key", "named", "personal", "tool_of"]
+__all__ = ["PARTICIPANT", "RESPONSE", "TRIAL", "Tool", "key", "named", "other_unit", "personal", "tool_of"]
 
 
 class Tool(NamedTuple):
@@ -56,6 +56,7 @@ RESPONSE = (
     *("urteil", "antwort", "bewertung"),
 )
 """Keys of columns with the response, the most usual first."""
+_BRACKET = re.compile(r"[(\[](.*)[)\]]")
 _PERSONAL = {
     *("ipaddress", "ip", "email", "emailaddress", "recipientemail", "name", "firstname", "lastname", "surname"),
     *("recipientfirstname", "recipientlastname", "username", "address", "street", "city", "place", "zip", "postcode"),
@@ -80,16 +81,28 @@ def named(columns: Sequence[str], wanted: Iterable[str], unit: str = "") -> list
         if hits := (
             [column for column in columns if column == name]
             or [column for column in columns if key(column) in same]
-            or [column for column in columns if key(re.sub(r"[(\[].*[)\]]", "", column)) in same]
-            or [column for column in columns if "." in column and same & {*map(key, column.split("."))}]
+            or [column for column in columns if key(_BRACKET.sub("", column)) in same]
+            or [column for column in columns if key(_called(column)) in same and not personal([column])]
         ):
             return hits
     return []
 
 
+def other_unit(column: str, unit: str) -> bool:
+    """Whether a column's name has a unit in brackets that is not `unit`."""
+    bracket = _BRACKET.search(column)
+    return bracket is not None and bracket[1].strip().casefold() != unit.casefold()
+
+
+def _called(column: str) -> str:
+    """The part of a dotted name that says what it is: the last one, but "x" of "x.id" and of "x.Q0"; "" for others."""
+    *before, last = column.split(".")
+    return (before[-1] if re.fullmatch(r"id|Q\d+", last) else last) if before else ""
+
+
 def personal(columns: Iterable[str]) -> list[str]:
     """The columns that by their name identify a person: address, name, place, id of a platform."""
-    return [column for column in columns if key(column) in _PERSONAL]
+    return [column for column in columns if key(column.rpartition(".")[2]) in _PERSONAL]
 
 
 def tool_of(columns: Collection[str]) -> Tool:
