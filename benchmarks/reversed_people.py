@@ -38,7 +38,7 @@ DEEPEST = 4  # participants who are left out, one after the other
 
 
 class Turned(Person):
-    """Participants, some of whom reverse the scale."""
+    """Participants with a flag for those who reverse the scale."""
 
     turned: Bool[Array, "*M"] = eqx.field(kw_only=True)
 

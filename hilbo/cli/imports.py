@@ -36,8 +36,8 @@ def imports(
     """
     if out.suffix != ".csv":
         raise InputError(f"{out}: is no name of a CSV file; choose one that ends in .csv.")
-    beside = {kind: out.with_name(f"{out.stem}.{kind}") for kind in ("mapping.toml", "import.json", "ids.csv")}
-    for path in (out, *(path for kind, path in beside.items() if kind != "mapping.toml" or mapping is None)):
+    outputs = {kind: out.with_name(f"{out.stem}.{kind}") for kind in ("mapping.toml", "import.json", "ids.csv")}
+    for path in (out, *(path for kind, path in outputs.items() if kind != "mapping.toml" or mapping is None)):
         check_free(path, force)
     from hilbo.study.file.reading import StudyFile
     from hilbo.study.formats.csv_rows import csv_text
@@ -50,21 +50,21 @@ def imports(
             files, StudyFile.load(study), given, source=str(mapping or "the mapping"), note=remark
         )
     except OpenMappingError as error:
-        where = beside["mapping.toml"]
+        where = outputs["mapping.toml"]
         write_new(where, mapping_text(error.mapping), force)
         raise InputError(f"{error} The rest is in {where}: complete it, then add --mapping {where}.") from None
     if force and not made.ids:  # the list of an earlier import would be of other ids
-        beside["ids.csv"].unlink(missing_ok=True)
+        outputs["ids.csv"].unlink(missing_ok=True)
     if made.ids:
         rows = [["participant", "id_in_export"], *([new, old] for old, new in made.ids.items())]
-        write_new(beside["ids.csv"], csv_text(rows), force)
+        write_new(outputs["ids.csv"], csv_text(rows), force)
     if mapping is None:
-        write_new(beside["mapping.toml"], mapping_text(used), force)
-    write_new(beside["import.json"], json.dumps(made.record, indent=2, ensure_ascii=False) + "\n", force)
+        write_new(outputs["mapping.toml"], mapping_text(used), force)
+    write_new(outputs["import.json"], json.dumps(made.record, indent=2, ensure_ascii=False) + "\n", force)
     write_new(out, made.table.to_csv(index=False), force)
     for sentence in made.sentences:
         print(sentence, file=sys.stderr)
     print(
-        f"{out}: written, by {mapping or beside['mapping.toml']}; next: hilbo aggregate {out} --study {study}",
+        f"{out}: written, by {mapping or outputs['mapping.toml']}; next: hilbo aggregate {out} --study {study}",
         file=sys.stderr,
     )

@@ -343,7 +343,7 @@ def test_keys_from_a_terminal(device, sets):
 
 
 def test_a_terminal_that_is_closed_ends_the_command():
-    """Else a device would move that no key can stop."""
+    """Without this the device would move without an operator."""
     pytest.importorskip("termios")
     master, slave = os.openpty()
     assert list(screen._waiting(slave)) == []

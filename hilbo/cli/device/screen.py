@@ -258,7 +258,7 @@ def _keyboard() -> Iterator[Callable[[], Iterator[str]]]:
 
 def _waiting(file: int) -> Iterator[str]:
     """The keys that were pressed in a terminal and not read yet; "q" if the terminal has been closed, so that no device
-    moves that nobody can stop."""
+    moves without an operator."""
     while select.select([file], [], [], 0)[0]:
         try:
             data = os.read(file, 1)

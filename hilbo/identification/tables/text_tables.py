@@ -22,6 +22,7 @@ from hilbo.identification.tables.headings import heading
 from hilbo.identification.tables.layout import Layout, Renamed, renamed
 from hilbo.study.formats.csv_file import place, read_cells
 from hilbo.study.formats.csv_rows import read_errors, say_delimiter
+from hilbo.study.formats.text_encoding import decoded
 
 __all__ = ["TextTable", "read_text_table"]
 
@@ -29,7 +30,6 @@ _DELIMITERS = (",", ";", "\t")
 _NEEDS = "a material table needs a header with units and the samples of a test"
 _FEWEST = 3  # rows of numbers, one after the other, that are taken for a table
 _LINE_END = re.compile(r"[\r\n]+")
-_CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")
 
 
 class TextTable(NamedTuple):
@@ -51,8 +51,8 @@ def read_text_table(path: str | os.PathLike, layout: Layout) -> TextTable:
         data = Path(path).read_bytes()
         if data[:4] == b"PK\x03\x04":
             raise ValueError  # which `read_errors` makes the sentence about spreadsheets
-        text, encoding = _decoded(data, source)
-        lines = list(io.StringIO(text.replace("\x00\r", "\r").replace("\x00\n", "\n"), newline=""))
+        text, encoding = decoded(data, source)
+        lines = list(io.StringIO(text, newline=""))
         names = renamed(layout)
         first, delimiter = _first_header(lines, names, source)
         blocks = list(_blocks(lines, first, delimiter, names, source))
@@ -78,24 +78,6 @@ def _lines_note(block: Block, before: int, blocks: str) -> str:
         )
     sentence = ", ".join(parts)
     return f"{sentence[0].upper()}{sentence[1:]}." if sentence else ""
-
-
-def _decoded(data: bytes, source: str) -> tuple[str, str]:
-    """The text of a file, and the name of its encoding, "" for UTF-8. Raises `UnicodeDecodeError`, and `InputError` for
-    bytes that are no text."""
-    sample = data[:2000]
-    zeros = [sample[k::2].count(0) for k in (0, 1)]
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return data.decode("utf-16"), "UTF-16"
-    if max(zeros) > len(sample) // 4:
-        return data.decode("utf-16-le" if zeros[1] > zeros[0] else "utf-16-be"), "UTF-16"
-    try:
-        return data.decode("utf-8-sig"), ""
-    except UnicodeDecodeError:
-        text = data.decode("cp1252")
-    if _CONTROL.search(text.replace("\x00\n", "\n").replace("\x00\r", "\r")):
-        raise InputError(f"{source}: is no text; export the table from the instrument's program as text or CSV.")
-    return text, "Windows-1252"
 
 
 def _first_header(lines: Sequence[str], names: Sequence[Renamed], source: str) -> tuple[int, str]:

@@ -28,7 +28,6 @@ from hilbo.report.figures.maps import (
     third_words,
 )
 from hilbo.report.figures.style import (
-    GREEN,
     ONE_COLUMN,
     ORANGE,
     RED,
@@ -49,7 +48,7 @@ __all__ = ["posterior_progress", "sets_on_map", "typical_person"]
 
 UNKNOWN = 0.8
 """Share of its standard deviation without answers above which a map is drawn as not sampled."""
-_MARKS = {"best": ("*", 170, GREEN), "mid": ("D", 45, ORANGE), "worst": ("X", 80, RED)}
+_MARKS = {"best": ("*", 170, RED), "mid": ("D", 45, ORANGE), "worst": ("X", 80, "white")}
 
 
 def typical_person(analysis: Analysis) -> int:

@@ -63,7 +63,7 @@ def is_missing(cell: str) -> bool:
 
 
 def is_absent(cell: str, levels: Collection[str] = ()) -> bool:
-    """Whether a cell of a parameter or stimulus holds no value: it is empty or a word for a missing value, and none of
+    """Whether a cell of a parameter or stimulus has no value: it is empty or a word for a missing value, and none of
     the `levels`. Numbers such as -1 are values."""
     return plain(cell) in _ABSENT and plain(cell) not in {plain(level) for level in levels}
 

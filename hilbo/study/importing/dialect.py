@@ -1,44 +1,16 @@
-"""Encoding and separator of CSV text of other programs. Loads no JAX, no pandas."""
+"""Separator and rows of CSV text of other programs. Loads no JAX, no pandas."""
 
-import codecs
 import csv
 import io
 import re
 
 from hilbo.errors import InputError
 
-__all__ = ["csv_cells", "decoded_text"]
+__all__ = ["csv_cells"]
 
-_MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 _SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"}
 _QUOTED = re.compile(r'"[^"]*"')
 _SAMPLE = 50  # lines in which separators are counted
-
-
-def decoded_text(content: bytes, source: str) -> tuple[str, list[str]]:
-    """Decode a file: UTF-8, UTF-16 with or without a byte order mark, else Windows-1252. Returns the text, and
-    sentences on an encoding other than UTF-8. Raises `InputError` for bytes that are no text."""
-    encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "")
-    if not encoding and b"\0" in content[:200]:
-        encoding = "utf-16-le" if content[1:2] == b"\0" else "utf-16-be"
-    try:
-        text = content.decode(encoding or "utf-8")
-    except UnicodeDecodeError as error:
-        if encoding:
-            raise InputError(f"{source}: is damaged {encoding} text; export it again, as UTF-8.") from error
-        text, encoding = _windows(content, source), "Windows-1252"
-    if "\0" in text:
-        raise InputError(f"{source}: is no text; export the table as CSV.")
-    named = encoding not in ("", "utf-8-sig")
-    return text, [f"{source}: is read as {encoding.upper()} text; look at its accents."] if named else []
-
-
-def _windows(content: bytes, source: str) -> str:
-    """Text of Windows-1252. Raises `InputError` for bytes that it does not have."""
-    try:
-        return content.decode("cp1252")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{source}: is no text in UTF-8, UTF-16 or Windows-1252; export it as UTF-8.") from error
 
 
 def csv_cells(text: str, source: str) -> tuple[list[int], list[list[str]], list[str]]:

@@ -18,7 +18,8 @@ from hilbo.errors import InputError
 from hilbo.study.formats.csv_file import read_cells
 from hilbo.study.formats.json_file import Content
 from hilbo.study.formats.parsing import UNREADABLE
-from hilbo.study.importing.dialect import csv_cells, decoded_text
+from hilbo.study.formats.text_encoding import decoded
+from hilbo.study.importing.dialect import csv_cells
 
 if TYPE_CHECKING:
     from openpyxl.worksheet._read_only import ReadOnlyWorksheet
@@ -53,7 +54,8 @@ def read_raw(path: Path) -> RawTable:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from error
     if suffix in _SHEETS or content.startswith(b"PK\x03\x04"):
         return _table(*_sheet_rows(content, str(path)), str(path), [])
-    text, notes = decoded_text(content, str(path))
+    text, encoding = decoded(content, str(path))
+    notes = [f"{path}: is read as {encoding} text; look at its accents."] if encoding else []
     if text.lstrip()[:1] in ("{", "[") and suffix not in (".csv", ".tsv"):
         return _table(*_json_rows(text, str(path)), str(path), notes)
     lines, rows, more = csv_cells(text, str(path))
