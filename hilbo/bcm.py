@@ -148,8 +148,8 @@ def _averaged(means: Float[Array, "M m"], variances: Float[Array, "M m"], presen
 def _merged(
     means: Float[Array, "M m"], explained: Float[Array, "M m"], prior: Float[Array, " m"], present: Bool[Array, " M"]
 ) -> tuple[_Map, Bool[Array, " m"]]:
-    """Population map of the committee machine, NaN at invalid points; and the mask (m,) of invalid points.
-
+    """Population map of the committee machine, NaN at invalid points; and the mask (m,) of invalid points. `explained`:
+    prior minus posterior variance; `prior`: prior variance.
     Invalid: a present participant has a mean that is not finite or a variance that is not positive, or the total
     precision is not positive.
     """

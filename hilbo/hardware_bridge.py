@@ -99,9 +99,10 @@ class Renderer:
 
         `damping` (N·s/m) and `delay` (s) are the values that a study assumes: a device with less damping, or one that
         checks its sets for a longer delay of the force, is refused. `patience` (s) is the timeout of one answer,
-        default 0.1 on a line. `capture` receives all bytes that arrive. `options` are those of the simulated device
-        (`simulator.Simulator`). Raises `InputError` for a line that cannot be opened, and `DeviceError` if no device
-        with this protocol answers.
+        default 0.1 on a line; `baud` the rate of a serial port. `capture` receives all bytes that arrive. `options` are
+        those of the simulated device (`simulator.Simulator`), which `close` ends. Raises `InputError` for a line that
+        cannot be opened, and for `options` of another device, and `DeviceError` if no device with this protocol
+        answers.
         """
         if where == "sim":
             from hilbo.device.local.simulator import Simulator
@@ -124,6 +125,7 @@ class Renderer:
         return self
 
     def __exit__(self, kind, error, trace) -> None:
+        """Call `close`. Its `DeviceError` is raised only if the block raised nothing, whose own error then follows."""
         try:
             self.close()
         except DeviceError:
@@ -390,7 +392,8 @@ class Renderer:
 
 def _connected(port, baud, patience, capture, simulator) -> Link:
     """Open the port (a name, or socket://HOST:PORT) and return a `Link` on it, in lockstep for such a `simulator`.
-    `patience`: timeout (s) of an answer, None for the default of this kind of device."""
+    `patience`: timeout (s) of an answer, None for the default of this kind of device. Raises `InputError` if the port
+    cannot be opened."""
     ticks = simulator.ticks if simulator is not None and simulator.lockstep else None
     if patience is None:
         patience = _LOCKSTEP if ticks else _SIMULATED if simulator else _ANSWER

@@ -177,6 +177,8 @@ class Posterior(eqx.Module):
         return points
 
     def __repr__(self) -> str:
+        """One line: numbers of participants (if stacked), responses and parameters, evidence of one participant, and
+        whether certified; the fields of a traced posterior."""
         mask = self.trials.mask
         if not has_values(self.trials.x, mask) or not concrete(self) or mask.ndim > 2:
             return eqx.tree_pformat(self)

@@ -68,6 +68,8 @@ class Trials(eqx.Module):
         return cls(*jax.device_put((padded, categories, np.arange(capacity) < count)))
 
     def __repr__(self) -> str:
+        """One line: numbers of participants (if stacked), responses and parameters, capacity; the fields of a traced
+        one."""
         if not has_values(self.x, self.mask):
             return eqx.tree_pformat(self)
         people = f"{self.x.shape[0]} people, " if self.mask.ndim == 2 else ""

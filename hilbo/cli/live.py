@@ -117,7 +117,7 @@ def session(
 
 def _say_changes(path: Path, own) -> None:
     """Print on stderr in which keys the study file at `path` differs from the one that a resumed session goes on with
-    (`own`); nothing if they are the same."""
+    (`own`); nothing if they are the same. Raises `InputError` for an invalid file."""
     from hilbo.study.file.reading import StudyFile
 
     if keys := StudyFile.load(path).changes(own):

@@ -254,7 +254,8 @@ def _check_register(register: Path, out: Path, reissue: str | None, force: bool)
 
 
 def _write_registration(file, plan, out: Path, force: bool) -> None:
-    """Write the page for a pre-registration of a plan of the study `file`, and print a remark on it on stderr."""
+    """Write the page for a pre-registration of a plan of the study `file`, and print a remark on it on stderr. Raises
+    `InputError` if the file `out` exists, unless `force`."""
     from hilbo import __version__
     from hilbo.report.registration import registration
 

@@ -56,7 +56,8 @@ def restarted(line: str) -> str:
 
 
 def fainted(line: str) -> str:
-    """Sentence: the heartbeats of this host have ended, because it hung or the helper process was ended."""
+    """Sentence, from the name of the `line` on: the heartbeats of this host have ended, because it hung or the helper
+    process was ended."""
     return (
         f"{line}: heartbeats have ended, because this program hung for {GRACE:g} s or their process was ended; the"
         " device lets go: connect again."
@@ -70,7 +71,7 @@ def deserted(silent: str) -> str:
 
 
 def line_gone(line: str, error: OSError) -> str:
-    """Sentence: the port can no longer be read or written because of `error`."""
+    """Sentence, from the name of the `line` on: the port can no longer be read or written because of `error`."""
     return (
         f"{line}: the line to the device is gone ({error}); it stops by itself, check power and cable, then connect"
         " again."
@@ -78,7 +79,8 @@ def line_gone(line: str, error: OSError) -> str:
 
 
 def not_taken(line: str, error: Exception) -> str:
-    """Sentence: the connection has ended because `error` was raised while received data were processed."""
+    """Sentence, from the name of the `line` on: the connection has ended because `error` was raised while received data
+    were processed."""
     return (
         f"{line}: the output of the device cannot be processed ({error}); heartbeats have ended and the device stops by"
         " itself; remove the cause, then connect again."

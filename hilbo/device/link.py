@@ -356,7 +356,8 @@ class Link:
             self.stops = message.ticks
 
     def _give(self, seq: int, message: Message) -> None:
-        """Deliver an answer to the waiting request; one that does not match is dropped and counted in `stray`."""
+        """Deliver an answer to the waiting request; one that does not match it, in kind and number `seq`, is dropped
+        and counted in `stray`, unless it acknowledges a `shout`."""
         with self._news:
             if self._expected is not None and self._answer is None and _fits(seq, message, self._expected):
                 self._answer = message
@@ -379,7 +380,8 @@ class Link:
         return why
 
     def _refusal(self, nack: Nack, request: str) -> Exception:
-        """Return the error for a NACK; set `restarted` if the NACK shows that the device has restarted."""
+        """Return the error for a NACK to the `request` (its name in PROTOCOL.md); set `restarted` if the NACK shows
+        that the device has restarted."""
         if nack.reason in (NackReason.BOOT_ID, NackReason.NO_HELLO) and request != "HELLO":
             self.restarted = True
             return DeviceError(failures.restarted(self.name), nack)

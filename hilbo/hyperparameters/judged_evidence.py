@@ -51,8 +51,9 @@ def maximise_judged(
     """Learn hyperparameters of stacked trials (M, n) by maximum evidence; where Laplace's evidence is off by more than
     `TRUSTED`, or not finite, learn them again by expectation propagation.
 
-    `learn`: names of hyperparameters; `shared`: the same for all participants, else individual ones; `inference`:
-    method of the evidence; with another than "laplace" nothing is checked, and the error is 0. Not under `jit`: what is
+    `learn`: names of hyperparameters; `shared`: the same for all participants, else individual ones; `weak_priors`: as
+    for `maximise_evidence`; `inference`: method of the evidence; with another than "laplace" nothing is checked, and
+    the error is 0. Not under `jit`: what is
     learnt again depends on values. Raises `InputError` for unknown or no names in `learn`, for variance, noise and
     thresholds together, and for exact inference.
     """

@@ -68,6 +68,7 @@ class MaximumEvidence(eqx.Module):
     learn: tuple[str, ...] = eqx.field(static=True)
 
     def __repr__(self) -> str:
+        """One line: the model, what was learnt, log evidence, and how the search ended; the fields of a traced one."""
         if not has_values(self.log_evidence, self.steps, self.converged, self.runaway):
             return eqx.tree_pformat(self)
         ended = "a hyperparameter ran away" if np.any(self.runaway) else "converged"

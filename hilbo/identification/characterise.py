@@ -176,7 +176,8 @@ def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str
 
 
 def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
-    """Yield a dict for each test that describes the noise of its residuals.
+    """Yield a dict for each test that describes the noise of its residuals: "autocorrelation" at lag one, "order" of
+    the autoregression, "effective_samples", "samples", "repeats" and "drift".
 
     "over_repeat_noise" is their RMS over the standard error of the mean of the repeats, in the test's own output;
     missing for a single repeat and for identical ones.

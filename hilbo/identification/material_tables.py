@@ -107,8 +107,9 @@ def _check_geometry(columns: Columns, layout: Layout, where: str) -> None:
 
 
 def _values(text: pd.DataFrame, heads: dict[str, Heading], layout: Layout, source: str) -> pd.DataFrame:
-    """Time with position and force, or moduli, as numbers in base units, with the rows of `text`. Raises `InputError`
-    for cells that are no numbers."""
+    """The columns of `heads` as numbers in base units, named by quantity, with the rows of `text`; strain and stress
+    become position (mm) and force (N) if the `layout` has area and gap. Raises `InputError` for cells that are no
+    numbers."""
     words = "a finite number; correct it, or delete that row"
     values = pd.DataFrame(
         {q: numbers(text, head.column, source, words, lambda v: v == v) * head.factor for q, head in heads.items()}
@@ -122,7 +123,8 @@ def _values(text: pd.DataFrame, heads: dict[str, Heading], layout: Layout, sourc
 def _kinds(text: pd.DataFrame, columns: Columns, layout: Layout, where: str, source: str) -> pd.Series:
     """Kind of test of each row: from the column `test` or the `layout`, or "modulus" or "compliance" by the `columns`.
 
-    Raises `InputError` for a missing or unknown kind, and for a modulus and a compliance in one table.
+    Raises `InputError` for a missing or unknown kind, for a kind given by the `layout` where the table determines it,
+    and for a modulus and a compliance in one table.
     """
     if columns.of("modulus") or columns.of("compliance"):
         if columns.of("modulus", "compliance"):

@@ -67,6 +67,7 @@ class Sampled(eqx.Module):
     kinds = MEASURED
 
     def __check_init__(self):
+        """Raise `InputError` for N below 1, T not above 0, and a lag or corner that is not "fit" or in its range."""
         if isinstance(self.N, int) and self.N < 1:
             raise InputError(f"N is {self.N}; it must be at least 1: the number of past samples.")
         if not 0 < self.T < np.inf:

@@ -135,7 +135,8 @@ def _solved(span, active, beta, alpha, Y, K_eff, lag):
     """Solve for the largest K1 by exchange, from above.
 
     Returns K1 (N/mm; NaN if the rounds are exhausted), the binding angle, and whether every K1 is passive. If `active`
-    is False nothing is searched, and every K1 counts as passive. `Y`: the damping of the device in N/mm.
+    is False nothing is searched, and every K1 counts as passive. `Y`: the damping of the device in N/mm; `lag`: of
+    `_lag`.
     """
     order = _order(span, alpha)
     grid, S = _grid(order), order.sums.at_dc

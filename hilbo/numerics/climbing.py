@@ -249,7 +249,8 @@ def _polish(
 ) -> tuple[_Point, Float[Array, ""]]:
     """Maximise `score` from `start` by Newton's method within [0, 1]^d; return the end and its score.
 
-    `options`: further options of `TrustRegionNewton`, such as "walls". Reaching `steps` is no error.
+    `steps`: largest number of steps; reaching it is no error. `gain`: the search ends where the score could rise by
+    less than this. `options`: further options of `TrustRegionNewton`, such as "walls".
     """
     import optimistix as optx  # slow to import, and needed only where a search is traced
 

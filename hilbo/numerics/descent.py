@@ -40,7 +40,9 @@ def descended(
     most: int = 100,
     remembered: int = 10,
 ) -> Descent[_T]:
-    """Minimise from `begin` (p,), where the function is `first` and is not evaluated again, within `bounds`.
+    """Minimise by L-BFGS-B within `bounds`, from `begin` (p,), where the function is `first` and not evaluated again.
+
+    Returns the lowest point's `aux`, not its coordinates.
 
     **Arguments:** `near`: decrease that a step must reach for another; `most`: steps; `remembered`: steps from which
     the curvature is estimated. A value or gradient that is not finite ends the descent, which then has not converged.

@@ -157,7 +157,8 @@ def arrives(y: PyTree, move: Float[Array, " p"], ends: Float[Array, "k p"]) -> B
 def _planned(
     expansion: Expansion, point: Float[Array, " p"], radius: Float[Array, ""], options: dict[str, Any]
 ) -> _State:
-    """State at `point` with the next step, between the "walls" of `options` or else its bounds "lower" and "upper".
+    """State at `point` with the next step, between the "walls" of `options`, with its mask "held" of coordinates that
+    do not move, or else between its bounds "lower" and "upper" (default: none).
 
     `expansion`: the function's, at `point`; `radius`: trust radius.
     """

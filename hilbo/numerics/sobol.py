@@ -19,9 +19,10 @@ __all__ = ["scrambled_sobol"]
 def scrambled_sobol(
     key: PRNGKeyArray, replicates: int, count: int, dim: int, dtype: DTypeLike
 ) -> Float[Array, "replicates count dim"]:
-    """Independent scrambles of the first `count` points of Sobol's sequence, in (0, 1)^dim. Raises `InputError`.
+    """Independent scrambles (`replicates`) of the first `count` points of Sobol's sequence, in (0, 1)^dim. Raises
+    `InputError` if `count` is not a power of 2, 2 or more.
 
-    `count` must be a power of 2, 2 or more. A random lower triangular bit matrix times the generators of each
+    A random lower triangular bit matrix times the generators of each
     dimension, and a random shift: every point is uniform, and the points of a scramble have the sequence's low
     discrepancy.
     """

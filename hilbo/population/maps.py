@@ -80,6 +80,7 @@ class RuleMap(eqx.Module):
     """What contexts add, by a recipe and a study with a random effect."""
 
     def __repr__(self) -> str:
+        """One line: aggregation method, "by points" or "exact", and the number of participants of a map by points."""
         people = (
             f", {self.experts.trials.mask.shape[0]} participants"
             if self.experts is not None and has_values(self.experts.trials.mask)

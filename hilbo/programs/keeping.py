@@ -137,6 +137,7 @@ class _CompiledHere:
         self._lock, self._inside, self._enabled = threading.Lock(), 0, True
 
     def __enter__(self):
+        """Switch the cache off, for the first of several threads in the context."""
         with self._lock:
             if self._inside == 0:
                 self._enabled = jax.config.jax_enable_compilation_cache  # type: ignore[attr-defined]
@@ -144,6 +145,7 @@ class _CompiledHere:
             self._inside += 1
 
     def __exit__(self, *_):
+        """Restore the cache's setting when the last thread leaves the context; errors pass."""
         with self._lock:
             self._inside -= 1
             if self._inside == 0:

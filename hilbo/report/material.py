@@ -121,7 +121,7 @@ def write_identification(
 
     For the sampled model renderer.toml, sets.csv (`reference_row`) and the figures of its set too. `content`: of
     `identification_result`; `damping`: the device's, N·s/m; None: the figures are drawn for the damping that the set
-    needs.
+    needs; `material`: as for `reference_row`.
     """
     from hilbo.report.figures import mechanics as plotting
 
@@ -150,6 +150,7 @@ def write_identification(
 def reference_row(result: Characterisation, material: str | None) -> pd.DataFrame:
     """A sets table with one set of source sysid: the parameters of the best curve with their 95 % profile intervals
     (NAME_low, NAME_high; empty where an end is open), and how they are rendered. The model must be the sampled one.
+    `material`: its name, which begins the set's and fills a column; None for a study without materials.
     """
     model, values = result.fit.model, result.fit.parameters()
     row: dict[str, Any] = {"set_id": f"{material} sysid" if material else "sysid", "source": "sysid"}

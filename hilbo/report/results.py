@@ -106,7 +106,7 @@ def result(
     **Arguments:** `truth`: true optimum (d,) in the unit cube, if known; `people`: of `people_of`, else computed here;
     `left_out`: sentences on excluded participants, which become the first warnings; `region`, `check`,
     `highest`: of `CohortResults`. With more than `MANY` participants, "participants" is the record `people` itself,
-    which `write_result` writes piece by piece.
+    which `write_result` writes piece by piece. Raises `InputError` for a `truth` without individual optima.
     """
     people = people_of(study, aggregate) if people is None else people
     best = aggregate.optimum

@@ -48,6 +48,8 @@ class Parameter:
     at: tuple[float, ...] = ()
 
     def __post_init__(self):
+        """Raise `InputError` for invalid levels, a range that is empty, not finite or too narrow, another scale, a log
+        scale from 0 or below, and ends of an integer that are no whole numbers."""
         path = f"parameters.{self.name}"
         if self.levels:
             check_levels(path, self.levels, self.correlation, self.ordered, self.at)
@@ -231,6 +233,8 @@ class Mechanics:
     delay: float = 0.0
 
     def __post_init__(self):
+        """Raise `InputError` for a number out of its range, an even N, an unknown memory, and an effective damping
+        whose ends do not increase."""
         for key, least in (("damping", 0.0), ("T", 0.0), ("K_eff", -math.ulp(0.0))):
             value = getattr(self, key)
             if not least < value < math.inf:

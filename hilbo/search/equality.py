@@ -141,7 +141,7 @@ def unbalanced(
 def _rows(
     parameters: Sequence[Parameter], constraints: Sequence[Constraint]
 ) -> tuple[Float[np.ndarray, "k d"], Float[np.ndarray, " k"]]:
-    """The equalities in shares, rows (k, d) of length 1 @ shares = ends (k,)."""
+    """The equalities as equations of the shares (d,): rows (k, d), each of length 1, @ shares = ends (k,)."""
     names, low = [p.name for p in parameters], np.array([p.low for p in parameters])
     width = np.array([p.high for p in parameters]) - low
     rows, ends = [], []

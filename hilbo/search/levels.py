@@ -54,7 +54,8 @@ def position_of(at: Sequence[float], index: _Array) -> _Array:
 
 
 def index_at(at: Sequence[float], unit: _Array) -> _Array:
-    """Index (array) of the level nearest to values of [0, 1], for levels at the positions `at`."""
+    """Index, as floats of the shape of `unit`, of the level nearest to values of [0, 1], for levels at the positions
+    `at`."""
     xp = namespace_of(unit)
     unit = xp.asarray(unit, xp.result_type(1.0, unit))
     middles = (0.5 * (low + high) for low, high in itertools.pairwise(_on_unit(at)))

@@ -24,8 +24,8 @@ def take(
 ) -> tuple[list[Float[np.ndarray, "_ d"]], int, int]:
     """Take the first `count` usable points from `chunks`, in parts; with the number found and the number tried.
 
-    `place` converts a chunk into points and a mask of the usable ones. Fewer than `count` are found only if less than
-    `LEAST_SHARE` is usable; that raises nothing.
+    `chunks` must not end. `place` converts a chunk into points and a mask of the usable ones. Fewer than `count` are
+    found only if less than `LEAST_SHARE` is usable; that raises nothing.
     """
     kept, usable_count, tried = [], 0, 0
     while usable_count < count and not (tried > 10 / LEAST_SHARE and usable_count < LEAST_SHARE * tried):

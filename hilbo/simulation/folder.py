@@ -58,7 +58,8 @@ def simulate_folder(
 
 
 def _simulated(study: Study, material: str, preset: str | None, count: int, seed: int) -> Simulated:
-    """Simulate the sessions of one material."""
+    """Simulate the sessions of `count` participants with one material, "" for a study without materials. Raises
+    `InputError` for a preset that is unknown or of other parameters."""
     population = with_truth(study, population_of(study, preset)[1], seed)
     people = simulate.people(study, population, count, seed)
     table = simulate.to_table(study, simulate.simulate_study(study, people, seed))

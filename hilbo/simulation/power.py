@@ -63,6 +63,7 @@ class Plan(eqx.Module):
     seed: int = eqx.field(static=True)
 
     def __check_init__(self):
+        """Raise `InputError` for numbers that are repeated or below 1, and for fewer than two studies."""
         for name in ("participants", "trials"):
             values = getattr(self, name)
             if not values or min(values) < 1 or len(set(values)) < len(values):

@@ -87,7 +87,8 @@ def _of_these_ranges(study: Study, population: Population) -> bool:
 
 
 def _stated(study: Study, table: SimulationTable) -> Population:
-    """Population specified in a [simulation] table."""
+    """Population specified in a [simulation] table; its truth is {} if the table has none. Raises `InputError` for a
+    truth that violates an equality of the study."""
     dim = study.space.dim
     for constraint in (c for c in study.space.constraints if c.equality and table.truth):
         (total,), (wrong,) = unbalanced(constraint, {k: np.array([v]) for k, v in table.truth.items()}, np.zeros(1))

@@ -87,7 +87,8 @@ def _answer(
     rng: np.random.Generator,
 ) -> tuple[list[str], int]:
     """Simulate a comparison of the stimuli x and y (d,) by one participant of `crowd`: labels of both classes, and the
-    preferred one (0: x, 1: y)."""
+    preferred one (0: x, 1: y). `contrast`: fraction of their difference by which each is judged further from the other.
+    """
     one = jax.tree.map(lambda leaf: np.asarray(leaf[person]), crowd)
     felt = np.array([one.perceived(point) for point in (x, y)])
     felt = felt + float(crowd.noise[person]) * rng.standard_normal(2)

@@ -56,8 +56,10 @@ def paper_tables(
 
     `sets` is a sets table (`tables.validation.sets_frame`); its column `role`, if it has one, names the best, mid and
     worst sets. Without it roles are taken from the names, as plans give them: "best", "foam best", "foam P07 best"; and
-    in table IV "aggregate" and "individual:PARTICIPANT", optionally after a material. Raises `InputError` for a bad
-    table.
+    in table IV "aggregate" and "individual:PARTICIPANT", optionally after a material.
+
+    A table that the data do not allow is None, and the last field has a sentence on it. Raises `InputError` for an
+    invalid validation table, several materials, and a `level` that is not between 0 and 1.
     """
     check_level(level)
     table = of_material(check_validation(validation, responses), None)

@@ -78,7 +78,7 @@ def preference_rates(table: pd.DataFrame, sets: Sequence[str] = (), *, level: fl
 
     `sets`: the ones to compare, in the order in which a pair names them; default: all, sorted. Columns `set`, `over`,
     `comparisons`, `wins`, `losses`, `ties`, and those of `rate`, which a pair with ties only does not have. An empty
-    table without preferences.
+    table without preferences. Raises `InputError` for a `level` that is not between 0 and 1.
     """
     check_level(level)
     compared = table[table["preferred"] != NONE]

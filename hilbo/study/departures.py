@@ -60,7 +60,8 @@ def changed_files(held: Sequence[SessionRow]) -> tuple[str, ...]:
 
 
 def _between(sessions: Sequence[SessionRow]) -> str:
-    """The days of the first and the last of these sessions, in UTC, as words; empty if no session has a time."""
+    """Clause, after a blank, with the days (UTC) of the first and the last of these sessions, which are in order of
+    time: " on 2026-03-01"; "" if no session has a time."""
     times = [session.began_at for session in sessions if session.began_at is not None]
     days = list(dict.fromkeys(datetime.fromtimestamp(t, UTC).date().isoformat() for t in times))
     if not days:
@@ -126,8 +127,8 @@ def _who(planned: Collection[str], had: Collection[str], what: str) -> list[str]
 
 
 def _confirmed(plans: Sequence[Plan], held: Sequence[SessionRow] | None) -> str:
-    """What agrees with the plans, as the end of a sentence: number of participants, of their answers, and whether their
-    sessions are known to follow the plans."""
+    """Agreement with the plans, all of one phase, as the end of a sentence: number of participants, for optimisations
+    also that of their answers, and whether their sessions followed the plans (not known if `held` is None)."""
     people = len({row.participant for plan in plans for row in plan.participants})
     them = "it" if len(plans) == 1 else "them"
     by = "which plan the sessions followed is not known here" if held is None else f"all sessions followed {them}"

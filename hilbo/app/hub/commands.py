@@ -50,7 +50,7 @@ async def carry_out(hub: HubInterface, what: str, message: Command) -> dict[str,
 
 
 def _event_of(what: str, message: Command) -> Callable[[LiveSession, float], Event]:
-    """A function of (state, time) that makes the event of a command other than resume, estop, clear and invite, or
+    """A function of (state, time) that makes the event of the command `what` (none of resume, estop, clear, invite), or
     raises `RefusedError`. Raises `InputError` for an empty note, and for a restore without a trial."""
     if what == "note":
         if not message.text.strip():

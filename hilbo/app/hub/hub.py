@@ -167,8 +167,8 @@ class Hub:
         return await asyncio.shield(asyncio.ensure_future(self._commit(make, mine)))
 
     async def _commit(self, make, mine):
-        """`commit`, but cancelled with its caller. After an answer it also gives the runner the times from which the
-        delay to the next rendering is computed."""
+        """Carry out `commit`, with the same arguments; cancelled with its caller. After an answer it also gives the
+        runner the times from which the delay to the next rendering is computed."""
         assert self._lock is not None
         async with self._lock:
             event = make(self.state, time.time())
@@ -263,8 +263,9 @@ class Hub:
         return {"accepted": message.trial, "again": event is None}
 
     async def press(self, what: str, message: Press, page: str | None) -> None:
-        """Carry out a participant's button: "break", "more" (another warm-up trial), "here" (sign of life of the page),
-        else begin: start the next block after the warm-up, or else let the runner present. `page` as in `answer`.
+        """Carry out a participant's button `what`: "break", "more" (another warm-up trial), "here" (sign of life of the
+        page), else begin: start the next block after the warm-up, or else let the runner present. `page` as in
+        `answer`.
         Raises `NotNowError`, also for a button that was pressed during another trial or presentation than the present
         one; `LogError`."""
         self._check_page(page)

@@ -93,7 +93,8 @@ class Interruptions:
             self._set_fault("device", task.exception())
 
     def _set_fault(self, what: str, error: BaseException | None) -> None:
-        """Set the fault of one kind of watch, or clear it (`error` None); the pages are notified if `fault` changes."""
+        """Set the fault of the watch named `what`, or clear it (`error` None); the pages are notified if `fault`
+        changes."""
         before = self.fault
         self._faults.pop(what, None)
         if error is not None:

@@ -280,8 +280,8 @@ class Runner:
         return Showing(trial.id, trial.presentation, step, show, trial.renderings.get(show), material)
 
     async def _missed(self, why: str) -> None:
-        """Log that the last requested step was not presented, which voids its trial, unless that is refused; then Begin
-        must be pressed."""
+        """Log that the last requested step was not presented, for the reason `why`, which voids its trial; a refusal is
+        ignored. Then Begin must be pressed."""
         hub, showing = self.hub, self._showing
         assert showing is not None  # only a step can be missed
         with contextlib.suppress(RefusedError):

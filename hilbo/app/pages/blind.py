@@ -54,7 +54,7 @@ def _labels(hub: HubInterface, trial: Trial | None) -> dict[str, str]:
 
 def _table(hub: HubInterface, rows: list[View]) -> View:
     """The table of trials, newest first, with a label for each rendering in the column after the remark. `rows`: those
-    of the full view, in the same order."""
+    of the full view, in the same order. The remark on a trial voided by a rule is cut, because it may have values."""
     labelled = []
     for trial, row in zip(reversed(hub.state.trials), rows, strict=True):
         place, answer, remark = row["cells"][:3]

@@ -61,8 +61,8 @@ class Decider:
         self._answer = jax.jit(lambda key, x: self._person.answer(key, x, jnp.asarray(0.5, x.dtype)))
 
     def __call__(self, trial: dict[str, Any], ask: str) -> str:
-        """The answer to one question about a trial of the experimenter's view: for "preferred" the side that is nearest
-        to the optimum, else a random draw of a response ("class_a", "class_b")."""
+        """The answer to one question (`ask`) about a trial of the experimenter's view: for "preferred" the side ("a",
+        "b") that is nearest to the optimum, for "class_a" and "class_b" a random draw of a response's label."""
         unit = {side: Rendering.of(self._study.space, values).unit for side, values in trial["renderings"].items()}
         if ask == "preferred":
             return min(unit, key=lambda side: self._distance(unit[side]))
@@ -94,7 +94,8 @@ def fast_study(source: Path, target: Path, seconds: float | None, warm_up: int |
 
 def example_sets(study: Study, population: Population) -> dict[str, dict[str, float]]:
     """Parameters of three renderings, "best", "mid" and "worst", by their distance from the truth of a simulated
-    population: of 256 candidates the nearest, the one a third of the way in that order, and the farthest."""
+    population, which must have one: of 256 candidates the nearest, the one a third of the way in that order, and the
+    farthest. Physical values by parameter."""
     space, points = study.space, study.space.candidates(256, 0)
     order = np.argsort(nrmse(points, Rendering.of(space, population.truth).unit, levels_of(space.parameters)))
     chosen = {"best": order[0], "mid": order[len(order) // 3], "worst": order[-1]}
@@ -157,9 +158,10 @@ def rehearse(
     (`mishaps`), names of screenshots, path of the log, number of events.
 
     Writes study.toml, the log, screenshots of both pages, result.json with the summary, and for another phase than
-    optimisation plan.json into `out`. `seconds`: duration of every step, by default the study's; `preset`: population,
-    by default the study's. Raises `InputError` for a study that is refused, before `out` is made, and `RuntimeError` if
-    the server does not start.
+    optimisation plan.json into `out`. `seconds` and `warm_up`: duration of every step and number of warm-up trials, by
+    default the study's, as is `preset`, the population; `say`: called with each stage. Of several materials the first
+    is taken. Raises `InputError` for a study that is refused, before `out` is made, and `RuntimeError` if the server
+    does not start.
     """
     Study.load(source)  # a refusal leaves no folder behind
     out.mkdir(parents=True, exist_ok=True)
@@ -190,8 +192,8 @@ def rehearse(
 
 @contextlib.contextmanager
 def _by_device(arguments: list[str], decide: Decider):
-    """Run the server with a simulated device; yields its links, `decide`, and a function that makes from `watch`
-    (returns the experimenter's view) what has the finger press (`_presser`)."""
+    """Run `hilbo session` with these arguments and a simulated device; yields its links, `decide`, and a function that
+    makes from `watch` (returns the experimenter's view) what has the finger press (`_presser`)."""
     finger = Simulator(finger="rest")
     try:
         with server(*arguments, "--device", finger.port) as (_, links):
@@ -260,8 +262,9 @@ def _session(program, links, decide, touches, out, say) -> dict[str, Any]:
 
 
 def _lead(participant: Participant, window, experimenter, screens: Path, say: Callable[[str], Any]) -> int:
-    """Act as the participant until the session ends, with a screenshot of each new phase and at some numbers of
-    answers; returns how many HOLDs were cleared."""
+    """Act as the participant until the session ends, with screenshots in `screens` of the page `window` at each new
+    phase, and of `experimenter` at some numbers of answers; `say` gets the number of answers. Returns how many HOLDs
+    were cleared."""
     taken: set[tuple[str, str]] = set()
     watched, cleared = {1, 4, 8}, 0
     while True:

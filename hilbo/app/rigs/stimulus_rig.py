@@ -295,8 +295,8 @@ class StimulusRig:
     # How long things may take.
 
     def _order(self, do: str, showing: Showing | None = None, trial: str = "") -> None:
-        """Give the next order; a program with force, or one told to stop, is dropped unless it reports neutral in
-        time."""
+        """Give the next order, `do` being "present", "neutral" or "stop", the first with `showing` and the trial's
+        name. At the others a program with force, and at "stop" any, is dropped unless it reports neutral in time."""
         if self.order.do != "present" or do != "present":
             self._cancel_timer("neutral")
         self._replace_order(Order(self.order.number + 1, do, showing, trial))

@@ -268,13 +268,15 @@ def _presenter(hub: Served, role: Role) -> StimulusRig:
 
 
 async def _hello(hub: Served, role: Role, request: Request) -> Response:
-    """Accept a program or preparer's page that joins (`StimulusRig.hello`)."""
+    """Accept a program or preparer's page that joins (`StimulusRig.hello`). Raises `InputError`, which the server
+    answers."""
     message = await _message(messages.Hello, request)
     return _json(await _presenter(hub, role).hello(message, _bearer(request) or ""))
 
 
 async def _report(hub: Served, role: Role, request: Request) -> Response:
-    """Apply a report; the response is the current order, perhaps later (`StimulusRig.report`)."""
+    """Apply a report; the response is the current order, perhaps later (`StimulusRig.report`). Raises `InputError`,
+    which the server answers."""
     return _json(await _presenter(hub, role).report(await _message(messages.Report, request)))
 
 

@@ -46,7 +46,8 @@ def lines_of(status: int, content: Mapping[str, Any]) -> str:
 
 
 def _lines(content: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
-    """The fields of each line but the first: one line for each key, and for each value and parameter."""
+    """Yield the fields of each line but the first: (key, value) for each key of a response's content, and lines of
+    their own for each entry of `values` and each of `parameters`."""
     for key, value in content.items():
         if key == "values":
             yield from (("value", name, number) for name, number in value.items())

@@ -142,7 +142,8 @@ _OF_A_SET = ("K0", "K1", "B1", "alpha", "N", "T", "memory", "states", "force_lim
 
 def chosen_set(chosen: Chosen, line: Line) -> dict[str, Any] | None:
     """The chosen set as arguments of `Renderer.send`, or None if none is chosen. Numbers given override those of the
-    table. Raises `InputError` for a set that is incomplete or not in the table."""
+    table. Raises `InputError` for a set that is incomplete or not in the table, and for a table of several without a
+    name."""
     given = {name: value for name in _OF_A_SET if (value := getattr(chosen, name)) is not None}
     if chosen.sets is not None:
         named_sets = sets_of(chosen.sets, line, chosen.K_eff)

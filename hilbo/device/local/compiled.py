@@ -51,7 +51,8 @@ def compiled(name: str, what: str, parts: Sequence[str], sources: Sequence[str] 
 
 
 def _check_private(path: Path, what: str) -> None:
-    """Raise `DeviceError` if the path exists and belongs to, or may be changed by, another user."""
+    """Raise `DeviceError` if the path exists and belongs to, or may be changed by, another user. `what`: name of the
+    program, for messages, here and below."""
     if os.path.lexists(path) and not is_private(path):
         raise DeviceError(
             f"{path}: {what} is not run, since this belongs to, or may be changed by, another user; delete it, or set"

@@ -124,9 +124,10 @@ def _as_long(names: list[str], rows: Rows, source: str) -> tuple[list[str], Rows
 
 
 def chosen(blocks: Sequence[Block], layout: Layout, source: str) -> tuple[Block, str]:
-    """The block to read, or the chosen ones as a single one, and a remark on which they are.
+    """The block to read, or the chosen ones as a single one, and a remark on which they are ("" if none was chosen).
 
-    Raises `InputError` for several blocks without a choice, a number without a block, and blocks of different columns.
+    `layout.blocks`: their numbers, from 1, among the blocks that have rows. Raises `InputError` for several blocks
+    without a choice, a number without a block, numbers that do not increase, and blocks of different columns.
     """
     filled = [block for block in blocks if block.rows] or list(blocks[:1])
     if not layout.blocks and len(filled) == 1:

@@ -67,7 +67,8 @@ def read_text_table(path: str | os.PathLike, layout: Layout) -> TextTable:
 
 
 def _lines_note(block: Block, before: int, blocks: str) -> str:
-    """Sentence on header, units, blocks and lines that were not read; "" for a table that begins in the first line."""
+    """Sentence on header, units, blocks and lines that were not read; "" for a table that begins in the first line.
+    `before`: number of lines above the header; `blocks`: clause on the blocks, or ""."""
     parts = [f"the header is in line {block.line}"] if before else []
     parts += [f"the units are in line {block.units}"] if block.units else []
     parts += [blocks] if blocks else []
@@ -97,7 +98,8 @@ def _first_header(lines: Sequence[str], names: Sequence[Renamed], source: str) -
 
 def _likely_header(lines: Sequence[str], filled: Sequence[int], source: str) -> tuple[int, str]:
     """Line and separator of what looks like a header although it names no quantities: the fullest line without numbers
-    above the first rows of numbers, or else the first line. Raises `InputError` if there is none above them."""
+    above the first rows of numbers, or else the first line. Raises `InputError` if the rows of numbers begin at the
+    first line, or if blanks separate their numbers."""
     for d in reversed(_DELIMITERS):  # a comma may be the decimal mark
         cells = {i: _split(lines[i], d) for i in filled}
         runs = [numerals(cells[i]) >= 2 for i in filled]

@@ -167,7 +167,7 @@ def model_at(
     """Hyperparameters at the given coordinates, completed by the specified ones (`stated`).
 
     Their unit is the specified noise, or the specified variance, or else a noise of 1. Only the shapes of `answers` are
-    used.
+    used. `fixed_point`: as in `PeopleModel`.
     """
     (people, _, d), dtype = answers.x.shape, answers.x.dtype
     shared, own = jnp.exp(coordinates["shared"]), jnp.exp(coordinates["own"])

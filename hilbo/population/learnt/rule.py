@@ -87,6 +87,7 @@ class Learnt(eqx.Module):
     """From whose answers they were learnt."""
 
     def __repr__(self) -> str:
+        """One line: theta, thresholds and noise of the model, log evidence, and whether the search converged."""
         model, sure = self.model, shown(self.converged)
         values = {name: shown(getattr(model, name)) for name in ("theta", "thresholds", "noise")}
         words = ", ".join(f"{name} {value}" for name, value in values.items())

@@ -280,8 +280,8 @@ def plane(study: Study, point: Float[ArrayLike, " d"], pair: tuple[int, int], ce
 def grid_slice(study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], third: float | None) -> Slice:
     """Mean and standard deviation of a map over the first two free parameters, NaN where not feasible.
 
-    `optimum` (d,) of the unit cube: where the other parameters are; `third`: value of the third one instead, or
-    None. `surface`: points (m, d) -> mean and variance (m,).
+    `optimum` (d,) of the unit cube: where the other parameters are; `third`: value of the third one instead, in the
+    unit cube too, or None. `surface`: points (m, d) -> mean and variance (m,). Needs two free parameters.
     """
     point = np.array(optimum, float)
     if third is not None:

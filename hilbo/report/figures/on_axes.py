@@ -73,8 +73,8 @@ def _new_axes() -> Axes:
 
 
 def _maximum(study: Study, model: Any) -> np.ndarray:
-    """Point (d,) of the unit cube with the largest mean in the feasible set: searched for a posterior, the optimum of
-    an aggregate. Raises `InputError` for a model of another type.
+    """Optimum (d,) in the unit cube: for a posterior the feasible point that is best by the study's goal, which is
+    searched for, for an aggregate its own optimum. Raises `InputError` for a model of another type.
     """
     if isinstance(model, Aggregate):
         return np.asarray(model.optimum.x)

@@ -133,7 +133,8 @@ def _decisions():
 
 
 def _sensitivity(content):
-    """Sentence with the shift of the optimum by learnt hyperparameters and by another inference."""
+    """Sentence with the shift of the optimum by learnt hyperparameters and, if there was one, by another inference.
+    `content`: of a material's part of result.json."""
     parts = [f"hyperparameters of maximum evidence move the optimum by {percent(content['optimised']['nrmse'], 1)}"]
     if "other_inference" in content:
         other = content["other_inference"]

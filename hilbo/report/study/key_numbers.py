@@ -111,7 +111,8 @@ def _goal_answers(analysis: Analysis) -> KeyNumber:
 
 
 def _validation(analysis: Analysis, validated: Validated) -> Iterator[KeyNumber]:
-    """Shares of the expected answer to best, mid and worst, and of preferences for the aggregate's set."""
+    """Yield the shares of the expected response to best, mid and worst, for three responses of which the highest is the
+    goal, and the rate of preference for the aggregate's set, if there is one; in per cent."""
     counts, responses = validated.tables.confusion, analysis.study.responses
     if analysis.study.goal.is_highest and len(responses) == len(_ROLES) == len(counts):
         for role, label, (_, row) in zip(_ROLES, reversed(responses), counts.iterrows(), strict=True):

@@ -45,7 +45,8 @@ def convergence_table(analysis: Analysis) -> pd.DataFrame:
     individual optima to theirs (median, quartiles), of both to the optimum of half of the participants, and cumulative
     responses that are the goal (median, quartiles).
 
-    The columns on halves are missing if there were too few participants to split.
+    Columns `trials`, `population`, `halves`, `individuals_to_half`, and `individuals_` and `top_answers_` with `low`,
+    `median` and `high`. Those on halves are missing if there were too few participants to split.
     """
     study, counts = analysis.study, analysis.progress.counts
     population_errors, individual_errors = analysis.progress.to_end()

@@ -69,6 +69,7 @@ class Session:
     step: Step = field(repr=False)
 
     def __repr__(self) -> str:
+        """One line: study, numbers of responses and trials, and the proposal in physical units, if there is one."""
         of, asked = self.study.file.selection.trials, ""
         if self.proposal is not None:
             values = zip(self.study.space.parameters, self.proposal.tolist(), strict=True)

@@ -68,7 +68,7 @@ class Design(eqx.Module):
 
 def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
     """Create the seeded part of a session: space-filling points (s, d), and the points to search, in the unit cube.
-    `count`: number of candidates, if no lattice is used."""
+    `count`: number of candidates, if no lattice is used. Raises `InputError` if too few points are feasible."""
     space, nodes = study.space, nodes_for(float(np.asarray(study.gp.kernel.theta).max()))
     on_lattice = space.even and space.dim in (2, 3) and study.file.selection.acquisition != "thompson"
     return Design(

@@ -243,7 +243,8 @@ def restorable(state: LiveSession, trial: int) -> bool:
 
 
 def pause(state: LiveSession, by: str, at: float) -> Event:
-    """Event that begins a break, requested by "participant" or "experimenter". Raises `RefusedError` during a break."""
+    """Event that begins a break, requested by "participant" or "experimenter". Raises `RefusedError` during a break and
+    after the session was aborted."""
     _running(state)
     if state.paused is not None:
         raise RefusedError("paused", "the session is paused already.")

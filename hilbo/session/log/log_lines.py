@@ -80,7 +80,8 @@ def is_unbegun(content: bytes) -> bool:
 def read_lines(content: bytes, path: str | os.PathLike) -> Read:
     """Decode the content of a log file and check all digests; `path` is for messages.
 
-    Raises InputError, with the line, if it is damaged, and if it has no complete first line.
+    An incomplete last line is left out, with a sentence in `dropped`. Raises InputError, with the line, if another one
+    is damaged, and if there is no complete first line.
     """
     dropped, header, events, good = "", None, [], []
     for number, line in enumerate(filter(None, re.split(rb"(?<=\n)", content)), 1):

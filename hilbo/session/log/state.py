@@ -153,8 +153,8 @@ class LiveSession:
         return sorted(k for k in left_out - have if k is not None)
 
     def _next_planned(self, block: int) -> int | None:
-        """Index of the next planned trial without an answer, those put off last; None if the block has enough, or none
-        is left."""
+        """Index of the next planned trial of a block that is neither answered nor skipped, those put off last; None if
+        the block has enough answers, or none is left."""
         if len(self.counted(block)) >= self.quota(block):
             return None
         done = {t.planned for t in self.counted(block)} | set(self.skipped(block))

@@ -57,7 +57,8 @@ def set_codes(sets: Mapping[str, Sets]) -> dict[str, str]:
 
 
 def coded(name: str, codes: Mapping[str, str]) -> str:
-    """Name of a set with the participant's id replaced by their code; names of the population's sets are unchanged."""
+    """Name of a set with the participant's id replaced by their code; names of the population's sets are unchanged.
+    `codes`: of every participant, by id; raises `KeyError` for another one."""
     person = _person(name)
     if not person:
         return name

@@ -164,8 +164,8 @@ def _compared(study: Study, aggregate: Aggregate, seed: int, say: Say) -> Conten
 
 
 def _with_learnt(population: CohortResults, seed: int, say: Say) -> CohortResults:
-    """The same results with map and optimum by the recommended method added to the alternatives; unchanged if the
-    study's method learns."""
+    """The same results with map and optimum by the recommended method added to the alternatives, and with `doubts`
+    about reversed scales by that method; unchanged if the study's method learns."""
     study, aggregate = population.study, population.aggregate
     if RULES[study.rule].learns:
         return population

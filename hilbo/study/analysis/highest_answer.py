@@ -51,7 +51,8 @@ def with_interval(
     x: Float[ArrayLike, " d"],
     drawn: Sequence[DrawnMap] = (),
 ) -> HighestAnswer:
-    """As `highest_answer`, of any map; `likelihood`: the median participant's."""
+    """As `highest_answer`, also of methods that do not predict a new participant. `likelihood`: the median
+    participant's; without `drawn` the interval is that of the given hyperparameters."""
     point = jnp.asarray(x)[None, :]
     of_map = likelihood, *map_.predict(point), map_.apart, map_.scale
     mean, variance, apart = (float(jnp.squeeze(value)) for value in of_map[1:4])

@@ -63,8 +63,11 @@ def hills_of(
 def _tops(
     scaled: Float[np.ndarray, "m d"], height: Float[np.ndarray, " m"], sd: Float[np.ndarray, " m"]
 ) -> Int[np.ndarray, " m"]:
-    """Index of the top of the hill that each point belongs to, (m,). `scaled`: points in length scales of the
-    kernel."""
+    """Index of the mode that each point belongs to, (m,): the points above it lead there. Two modes are merged if the
+    dip between them, below the lower one, is less than the standard deviation there.
+
+    `scaled` (m, d): points in length scales of the kernel; `height`, `sd` (m,): mean and standard deviation of the map.
+    """
     count, d = scaled.shape
     _, near = KDTree(scaled).query(scaled, min(3**d * _AROUND, _MOST, count))
     joined = list(range(count))  # to the top of a hill, or of one that this hill became part of

@@ -307,8 +307,8 @@ def _by_other_inference(
 
 
 def _rules(study: Study, cohort: Cohort, share: Share | None) -> list[str]:
-    """The methods whose maps are computed: the study's, and those with given hyperparameters that the number of
-    responses and a known `share` allow, the hierarchical one first."""
+    """The methods whose maps are computed, without repeats: the study's, then those with given hyperparameters that the
+    number of responses and a known `share` allow, of these the hierarchical one first."""
     few = cohort.counts().sum() <= _LARGEST_POOL
     given = sorted((RULES[name] for name in GIVEN), key=lambda rule: not rule.learns_share)
     beside = [r.name for r in given if (few or not r.exact_only) and (share is not None or not r.learns_share)]
@@ -319,7 +319,7 @@ def _rule_map(
     study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: Share | None, inference: str | None = None
 ) -> RuleMap:
     """Map by a method, from the posteriors or from all responses at once, as the method requires. A method that learns
-    must be resolved."""
+    must be resolved; `share` and `inference` (None: the study's) are not for it. Raises `InputError` as `rule_map`."""
     if RULES[rule].learns:
         assert study.learnt is not None
         return learnt_map(study.learnt, cohort.trials)

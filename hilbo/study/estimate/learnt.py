@@ -50,7 +50,7 @@ def by_rule(study: Study, rule: str) -> Study:
 
 def resolved(study: Study, cohort: Cohort) -> Study:
     """Copy of the study with the model learnt from the cohort (from a random sample of a large one). The same study if
-    its method does not learn, or has learnt already."""
+    its method does not learn, or has learnt already. Raises `InputError` without responses."""
     if not RULES[study.rule].learns or study.learnt is not None:
         return study
     learnt = learn_from_sample(cohort.trials, len(study.responses), study.stated, RECIPES[study.rule])

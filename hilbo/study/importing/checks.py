@@ -31,7 +31,7 @@ def check_mapping(mapping: Mapping, columns: Collection[str], study: StudyFile, 
 
 
 def _of_columns(mapping: Mapping, columns: Collection[str], study: StudyFile) -> Iterator[str]:
-    """Yield mistakes in [columns]."""
+    """Yield a sentence for each mistake in [columns]. `columns`: of the table."""
     parameters = [p.name for p in study.space.parameters]
     for name, column in mapping.columns.items():
         if name not in (*_OWN, *parameters, study.random_effect):
@@ -49,7 +49,8 @@ def _of_columns(mapping: Mapping, columns: Collection[str], study: StudyFile) ->
 
 
 def _of_needed(mapping: Mapping, study: StudyFile) -> Iterator[str]:
-    """Yield the columns that a trial table needs, and that the mapping has neither as columns nor in braces."""
+    """Yield a sentence for each column that a trial table needs and that the mapping has neither as a column nor in
+    braces."""
     response = mapping.columns.get("response", "")
     in_braces = braces(response)
     by_stimulus = STIMULUS in mapping.columns or STIMULUS in in_braces

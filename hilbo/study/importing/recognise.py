@@ -151,8 +151,9 @@ def _are_whole(cells: pd.Series) -> bool:
 
 
 def _responses(seen: _Seen, study: StudyFile, taken: set[str]) -> list[str]:
-    """Columns that may contain the response: by name, those in which some cell is a response of the study; else by
-    cells, those that contain only labels and missing marks."""
+    """Columns, none of them `taken`, that may contain the response: by name, those in which some cell is a response of
+    the study (the first one if all have the same cells); else, outside runs of numbered columns, those whose name ends
+    as "response" begins and whose cells are all responses; else those that contain only labels and missing marks."""
     free = [column for column in seen.columns if column not in taken]
     answered = [column for column in free if _has_answers(seen, column, study, whole=False)]
     if hits := named(answered, RESPONSE):
@@ -215,7 +216,11 @@ def _with_parameters(columns: Sequence[str], study: StudyFile) -> str:
 
 
 def _wide_parameters(seen: _Seen, study: StudyFile, wide: dict[str, list[str]], questions: list[str]) -> dict[str, str]:
-    """The columns of response and parameters of a wide table. `wide`: of `_wide`. Adds questions."""
+    """Key of [columns] ("response", parameter names) -> pattern of columns, of a wide table; "" where it is not
+    certain, and without the parameters if the response's pattern has no trial, or names stimuli.
+
+    `wide`: of `_wide`, pattern -> columns. Appends questions to `questions`.
+    """
     if len(wide) > 1:
         questions.append(f"the responses may be in {_some([*wide])}: write in [columns] which.")
         return {"response": "", **{p.name: "" for p in study.space.parameters}}
