@@ -196,6 +196,7 @@ def test_the_experimenter_sees_what_is_simulated_no_map_before_an_answer_and_no_
     experimenter.wait_for_selector("#map-box:visible")
     assert experimenter.locator("#map canvas").count() == 3
     assert "Hatched: infeasible" in experimenter.inner_text("#legend")
+    until(experimenter, "view.means.void && view.means.void.trial === 3")  # no trial comes while the dialog is open
     press(experimenter, "void", "a cough")
     until(experimenter, "document.querySelector('tr.voided td:nth-child(3)')?.textContent.includes('void: a cough')")
     until(experimenter, "document.getElementById('log').textContent.includes('is made void: a cough.')")
