@@ -242,7 +242,7 @@ def live(
     study: Path, out: Path, preset: str | None, phase: str, seconds: float | None, seed: int, say: Any
 ) -> dict[str, Any]:
     """Run a whole session without people into a new folder, for `hilbo simulate --live`, and return its summary
-    (`rehearse`). Raises `InputError` if the folder is not empty, or packages or a browser are missing."""
+    (`rehearse`), which is also result.json there. Raises `InputError` if the folder is not empty, or packages or a browser are missing."""
     need_extra()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: exists already; choose another --out.")
@@ -257,7 +257,9 @@ def live(
             "--live needs Chromium and playwright; install them (Debian: apt install chromium; pip install"
             " 'hilbo[browser]')."
         )
-    return rehearse(
+    from hilbo.report.result_file import write_result
+
+    summary = rehearse(
         study,
         out,
         preset=preset,
@@ -267,3 +269,5 @@ def live(
         seed=seed,
         say=say,
     )
+    write_result(summary, out)
+    return summary

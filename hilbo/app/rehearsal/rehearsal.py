@@ -157,11 +157,10 @@ def rehearse(
     """Run a session and return its summary: answers, duration, delays (ms), HOLDs cleared, JavaScript errors
     (`mishaps`), names of screenshots, path of the log, number of events.
 
-    Writes study.toml, the log, screenshots of both pages, result.json with the summary, and for another phase than
-    optimisation plan.json into `out`. `seconds` and `warm_up`: duration of every step and number of warm-up trials, by
-    default the study's, as is `preset`, the population; `say`: called with each stage. Of several materials the first
-    is taken. Raises `InputError` for a study that is refused, before `out` is made, and `RuntimeError` if the server
-    does not start.
+    Writes study.toml, the log, screenshots of both pages, and for another phase than optimisation plan.json into `out`.
+    `seconds` and `warm_up`: duration of every step and number of warm-up trials, by default the study's, as is
+    `preset`, the population; `say`: called with each stage. Of several materials the first is taken. Raises
+    `InputError` for a study that is refused, before `out` is made, and `RuntimeError` if the server does not start.
     """
     Study.load(source)  # a refusal leaves no folder behind
     out.mkdir(parents=True, exist_ok=True)
@@ -186,7 +185,6 @@ def rehearse(
         summary = _session(program, links, decide, touches, out, say)
     summary["log"] = links["log"]
     summary["events"] = len(read_log(links["log"], study.file)[1])
-    (out / "result.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")
     return summary
 
 
