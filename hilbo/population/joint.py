@@ -21,14 +21,14 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from hilbo.kernels import gram
 from hilbo.numerics.linalg import cholesky, eigh, solve_lower, solve_lower_transposed
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 
-__all__ = ["JointMap", "joint_map", "posterior_map"]
+__all__ = ["JointMap", "joint_map", "posterior_map", "quick_optima"]
 
 
 class JointMap(eqx.Module):
@@ -113,9 +113,60 @@ def _roots(covariance: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Float[
 @program
 def posterior_map(posterior: Posterior, x: Float[Array, "m d"]) -> JointMap:
     """One posterior at points (m, d) as a joint Gaussian, such as that of the hierarchical model's shared function."""
+    mean, covariance = _moments(posterior, x)
+    return JointMap(mean, _root_by_eigenvalues(covariance))
+
+
+def quick_optima(
+    posterior: Posterior,
+    x: Float[Array, "m d"],
+    key: PRNGKeyArray,
+    count: int,
+    closeness: Callable[[Float[Array, "n m"]], Float[Array, "n m"]],
+    block: int = 256,
+) -> Float[Array, " m"]:
+    """As `posterior_map(posterior, x).optima`, by another sample in a fifth of the time.
+
+    The root is a Cholesky factor, and the draws are in pairs, mean + d and mean - d, and in single precision, whose
+    rounding is far below their spread. The optimum of a versioned method depends on its draws and keeps the other
+    sample. Can be traced.
+    """
+    mean, root = (each.astype(jnp.float32) for each in _mean_and_root(posterior, x))
+    blocks = -(-count // block)
+
+    def add(total, key):
+        away = jax.random.normal(key, (block // 2, len(mean)), mean.dtype) @ root.T
+        best = jnp.argmax(closeness(jnp.concatenate([mean[None] + away, mean[None] - away])), axis=1)
+        return total.at[best].add(1.0), None
+
+    total, _ = jax.lax.scan(add, jnp.zeros_like(x[:, 0]), jax.random.split(key, blocks))
+    return total / (blocks * block)
+
+
+def _moments(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
+    """Mean (m,) and covariance (m, m) of a posterior at points (m, d)."""
     kernel = posterior.gp.kernel
     cross = gram(kernel, posterior.trials.x, x)
     explained_root = posterior.latent.factor @ cross
-    eigenvalues, vectors = eigh(gram(kernel, x, x) - explained_root.T @ explained_root)
-    scale = jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))  # below 0 by rounding
-    return JointMap(posterior.latent.weights @ cross, vectors * scale[None, :])
+    return posterior.latent.weights @ cross, gram(kernel, x, x) - explained_root.T @ explained_root
+
+
+def _root_by_eigenvalues(covariance: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """R with R R' = K, (m, m); eigenvalues below 0, which are rounding, are taken as 0."""
+    eigenvalues, vectors = eigh(covariance)
+    return vectors * jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[None, :]
+
+
+def _mean_and_root(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
+    """Mean (m,) and a root R of the covariance, R R' = K (m, m), at points (m, d).
+
+    R is the Cholesky factor of the distinct points, whose rows are repeated for copies (of corners and levels), or by
+    eigenvalues if their covariance is singular to rounding all the same.
+    """
+    mean, covariance = _moments(posterior, x)
+    first = jnp.argmax(jnp.all(x[:, None] == x[None], axis=2), axis=1)  # copy of each point
+    distinct = first == jnp.arange(len(first))
+    both, eye = distinct[:, None] & distinct[None, :], jnp.eye(len(first), dtype=covariance.dtype)
+    factor = cholesky(jnp.where(both, covariance, eye))[first]
+    usable = jnp.all(jnp.isfinite(factor))
+    return mean, jax.lax.cond(usable, lambda _: factor, _root_by_eigenvalues, covariance)

@@ -10,7 +10,7 @@ import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.kernels import gram
-from hilbo.population.joint import joint_map
+from hilbo.population.joint import joint_map, posterior_map, quick_optima
 from hilbo.study.estimate.optimum import predict_people
 
 GP = OrdinalGP(RBF(8.0, 1.7), OrdinalProbit((-0.5, 0.5), 0.5))
@@ -95,3 +95,18 @@ def test_the_many_draws_of_the_map_have_its_moments():
     counted = np.bincount(draws.argmax(axis=1), minlength=30) / 40_000
     assert shares.sum() == pytest.approx(1.0)
     assert np.abs(shares - counted).max() < 4.5 * np.sqrt(0.5 / 40_000)
+
+
+@pytest.mark.parametrize("copies", [False, True])
+def test_quick_draws_are_as_often_largest(copies):
+    """Of points that may occur twice, of which the first gets all draws; and of so many that K is singular."""
+    posterior = cohort(0)
+    x = jnp.asarray(np.random.default_rng(6).uniform(size=(30, 2)))
+    x = jnp.concatenate([x, x[:5]]) if copies else x
+    shares = np.asarray(posterior_map(posterior, x).optima(jax.random.key(1), 40_000))
+    quick = np.asarray(quick_optima(posterior, x, jax.random.key(2), 40_000, lambda f: f))
+    assert quick.sum() == pytest.approx(1.0) and quick[30:].sum() == 0.0
+    first = shares[:30] + np.pad(shares[30:], (0, 30 - len(shares[30:])))
+    assert np.abs(quick[:30] - first).max() < 4.5 * np.sqrt(0.5 / 40_000)
+    near = 0.5 + 1e-9 * x  # whose covariance has no Cholesky factor
+    assert np.isfinite(quick_optima(posterior, near, jax.random.key(3), 512, lambda f: f)).all()

@@ -16,6 +16,7 @@ from hilbo.population.shared.hierarchical import PersonKernel, fit_people, of_pe
 from hilbo.population.shared.low_rank import shared_evidence
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.posterior import shared_function
+from hilbo.population.shared.system import prior_of, system_at
 from hilbo.population.shared.tallies import CountTerms, Tallies, tallied
 
 EXACT = 1e-15  # what features may leave where nothing is to be left
@@ -54,11 +55,12 @@ def together(trials):
 
 
 @eqx.filter_jit
-def with_slopes(people, answers, tolerance):
-    """The evidence and its slopes: one program for all tests."""
+def with_slopes(people, answers, tolerance, room=PEOPLE * ANSWERS):
+    """The evidence and its slopes: one program for all tests. With more room than responses every system is solved by
+    the matrix of the responses, else by that of the features."""
 
     def of(people):
-        pivots = pivots_of(jax.lax.stop_gradient(people.unit), answers, 24, tolerance)
+        pivots = pivots_of(jax.lax.stop_gradient(people.unit), answers, room, tolerance)
         end = shared_evidence(people, answers, answers.blank, pivots)
         return end.value, end
 
@@ -87,6 +89,33 @@ def test_is_the_dense_model():
     for by_features, by_all in zip(posterior.predict(x), shared_posterior(dense).predict(x), strict=True):
         np.testing.assert_allclose(by_features, by_all, atol=1e-11)
     assert bool(posterior.certificate.converged)
+
+
+def test_the_matrix_of_the_responses_and_that_of_the_features_give_the_same():
+    people, answers = model(), apart(stacked())
+    ends = [with_slopes(people, answers, strong(EXACT), room) for room in (24, 32)]
+    for by_features, by_responses in zip(*map(jax.tree.leaves, ends), strict=True):
+        np.testing.assert_allclose(by_responses, by_features, rtol=1e-9, atol=1e-11)
+
+
+def test_a_system_is_the_same_by_either_matrix():
+    people, answers = dataclasses.replace(model(), effect=strong(0.3)), apart(stacked())
+    answers = dataclasses.replace(answers, context=jnp.asarray(np.arange(24).reshape(3, 8) % 4), contexts=4)
+    pivots = pivots_of(people.unit, answers, 32, EXACT)
+    prior = prior_of(people, answers, pivots)
+    curvature = jnp.asarray(np.random.default_rng(2).uniform(0.0, 2.0, (3, 8)) * np.asarray(answers.asked))
+    systems = [system_at(each, curvature) for each in (prior, prior._replace(together=None))]
+    assert [each.of_responses for each in systems] == [True, False]
+    right = jnp.asarray(np.random.default_rng(3).normal(size=(3, 8)))
+    some = jnp.asarray(np.random.default_rng(4).normal(size=(5, 32)))
+    for of in (
+        lambda s: s.log_determinant,
+        lambda s: s.solve(right),
+        lambda s: s.covariance(),
+        lambda s: s.explained(32).T @ s.explained(32),
+        lambda s: s.explained_variance(some),
+    ):
+        np.testing.assert_allclose(*map(of, systems), rtol=1e-10, atol=1e-11)
 
 
 def test_points_that_lie_close_together_lose_no_digits():

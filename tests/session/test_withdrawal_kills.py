@@ -11,7 +11,7 @@ from withdrawn_study import PEOPLE, Schedule, contents, faults, make_study, nami
 
 from hilbo.errors import InputError
 from hilbo.session.withdrawal.withdrawal import delete_participant
-from hilbo.study.disk.lock import locked_folder
+from hilbo.study.disk.lock import LOCK, locked_folder
 from hilbo.study.disk.new_folder import new_folder
 
 
@@ -122,8 +122,10 @@ def test_what_killed_commands_left_goes_too(whole, tmp_path):
     (tmp_path / "copy" / "logs" / ".hilbo-0123.part").write_text("P02")
     (tmp_path / "copy" / "logs" / ".map-01234567.part").mkdir()
     (tmp_path / "copy" / "logs" / ".map-01234567.part" / "result.json").write_text("P02")
+    (tmp_path / "copy" / "map" / LOCK).touch()  # of a folder with nothing in it that several commands rewrite
     delete_participant(tmp_path / "copy", "P02")
     assert faults(tmp_path / "copy", {"P02"}, {*PEOPLE} - {"P02"}) == []
+    assert not [*(tmp_path / "copy").rglob(LOCK)]
 
 
 def test_results_that_are_being_made_are_waited_for_and_none_begin_meanwhile(whole, tmp_path, monkeypatch):

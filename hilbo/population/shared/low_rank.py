@@ -13,7 +13,7 @@ a random effect u_c of context c, such as the clip, is one more feature, effect^
 
 and with W the curvatures, L_j L_j' = I + W_j^(1/2) K_j W_j^(1/2), A_j = L_j^-1 W_j^(1/2) F_j and S = I + sum_j A_j'A_j
 every system is solved by blocks of one participant's responses and one of r x r: M n^3 + M n^2 r + M n r^2 + r^3 in
-place of (M n)^3. S is the posterior precision of the weights of g, g(x) = shared^(1/2) phi(x)'w.
+place of (M n)^3 (`system`). S is the posterior precision of the weights of g, g(x) = shared^(1/2) phi(x)'w.
 
 Laplace's method by Newton's steps (`hilbo.newton_steps`). The evidence has exact first derivatives, by the implicit
 function theorem at the mode. References: Rasmussen & Williams (2006), sections 3.4 and 5.5.1; Snelson & Ghahramani
@@ -21,123 +21,25 @@ function theorem at the mode. References: Rasmussen & Williams (2006), sections 
 the factorisation.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hilbo.gaussian import distance, residual_tolerance
-from hilbo.kernels import gram
-from hilbo.numerics.sharding import of_each_person, sharded
-from hilbo.population.shared.features import Pivots, features_of
+from hilbo.numerics.sharding import of_each_person
+from hilbo.population.shared.features import Pivots
 from hilbo.population.shared.people_model import PeopleModel
 from hilbo.population.shared.scale_use import of_person
+from hilbo.population.shared.system import LowRankPrior, System, prior_of, system_at
 from hilbo.population.shared.tallies import Expansion, Tallies, expand_counts
 
-__all__ = [
-    "AtWeights",
-    "LowRankPrior",
-    "Mode",
-    "SharedEvidence",
-    "System",
-    "evidence_at",
-    "mode_of",
-    "newton_step",
-    "prior_of",
-    "shared_evidence",
-    "system_at",
-]
+__all__ = ["AtWeights", "Mode", "SharedEvidence", "evidence_at", "mode_of", "newton_step", "shared_evidence"]
 
 _STEPS = 100
-
-
-# --- the prior, and what answers make of it
-
-
-class LowRankPrior(NamedTuple):
-    """Prior covariance K = F F' + blockdiag(K_j) of all responses' latent values: `features` F (M, n, r) and `blocks`
-    K_j (M, n, n).
-    """
-
-    features: Float[Array, "M n r"]
-    blocks: Float[Array, "M n n"]
-
-    def times(self, weights: Float[Array, "M n"]) -> Float[Array, "M n"]:
-        """K a for weights a, (M, n) -> (M, n); the result is sharded over devices as K is."""
-        together = jnp.einsum("jnr,jn->r", self.features, weights)
-        return sharded(self.features @ together + jnp.einsum("jnm,jm->jn", self.blocks, weights))
-
-
-class System(NamedTuple):
-    """Factors of the matrix of Newton's steps, at curvatures W: W^(1/2), L_j, A_j, S with its Cholesky factor, and log
-    |I + K W|.
-    """
-
-    root: Float[Array, "M n"]  # W^(1/2)
-    lower: Float[Array, "M n n"]  # L_j
-    half: Float[Array, "M n r"]  # A_j
-    precision: Float[Array, "r r"]  # S
-    factor: Float[Array, "r r"]  # its triangular factor
-    log_determinant: Float[Array, ""]  # log |I + K W|
-
-    def solve(self, right: Float[Array, "M n"]) -> Float[Array, "M n"]:
-        """(K + W^-1)^-1 y for y (M, n), computed without W^-1; 0 where W is 0."""
-        first = _each(lambda p: solve_triangular(p[0], p[1], lower=True), (self.lower, self.root * right))
-        together = jax.scipy.linalg.cho_solve((self.factor, True), jnp.einsum("jnr,jn->r", self.half, first))
-        rest = first - self.half @ together
-        return self.root * _each(lambda p: solve_triangular(p[0], p[1], lower=True, trans=1), (self.lower, rest))
-
-
-def _each(function: Callable[..., Any], people: PyTree, *shared: Any) -> Any:
-    """Stacked results of `function(person, *shared)` for each row of `people`, one after the other on each device."""
-
-    def some(people, *shared):
-        return jax.lax.map(lambda person: function(person, *shared), people)
-
-    return of_each_person(some, people, *shared)
-
-
-def prior_of(model: PeopleModel, answers: Tallies, pivots: Pivots) -> LowRankPrior:
-    """Prior covariance of the latent values at all points of the responses; contexts of a random effect are features
-    too.
-    """
-    unit = of_each_person(lambda x, kernel, pivots: features_of(kernel, pivots, x), answers.x, model.unit, pivots)
-
-    def block(person, kernel, own, shared):
-        x, own_features = person
-        covariance = gram(kernel, x, x)
-        return own * covariance + shared * (covariance - own_features @ own_features.T)
-
-    features = jnp.sqrt(model.shared) * unit
-    if model.effect is not None:
-        of_context = jax.nn.one_hot(answers.context, answers.contexts, dtype=unit.dtype)
-        features = jnp.concatenate([features, jnp.sqrt(model.effect) * of_context], axis=-1)
-    return LowRankPrior(sharded(features), _each(block, (answers.x, unit), model.unit, model.own, model.shared))
-
-
-def system_at(prior: LowRankPrior, curvature: Float[Array, "M n"]) -> System:
-    """Factors of the matrix of Newton's steps at curvatures W >= 0, (M, n); where W is 0 a response has no
-    influence.
-    """
-    answered = curvature > 0
-    root = jnp.where(answered, jnp.sqrt(jnp.where(answered, curvature, 1.0)), 0.0)
-
-    def person(prior_and_root):
-        block, features, root = prior_and_root
-        lower = jnp.linalg.cholesky(jnp.eye(len(root), dtype=root.dtype) + root[:, None] * block * root[None, :])
-        return lower, solve_triangular(lower, root[:, None] * features, lower=True)
-
-    lower, half = _each(person, (prior.blocks, prior.features, root))
-    flat = half.reshape(-1, half.shape[2])
-    precision = jnp.eye(half.shape[2], dtype=root.dtype) + flat.T @ flat
-    factor = jnp.linalg.cholesky(precision)
-    logs = jnp.sum(jnp.log(jnp.diagonal(lower, axis1=1, axis2=2))) + jnp.sum(jnp.log(jnp.diagonal(factor)))
-    return System(root, lower, half, precision, factor, 2.0 * logs)
 
 
 def _expand(model: PeopleModel, answers: Tallies, eta: Float[Array, "M n"]) -> Expansion:

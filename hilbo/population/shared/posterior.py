@@ -5,19 +5,19 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve, solve_triangular
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
 from hilbo.kernels import Stationary, gram
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.numerics.linalg import eigh
 from hilbo.numerics.sharding import of_each_person, sum_over_people
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.shared.features import Pivots, features_of, root_of_pivots
-from hilbo.population.shared.low_rank import Mode, System, evidence_at, mode_of, newton_step, prior_of
+from hilbo.population.shared.low_rank import Mode, evidence_at, mode_of, newton_step
 from hilbo.population.shared.people_model import PeopleModel
+from hilbo.population.shared.system import System, prior_of
 from hilbo.population.shared.tallies import Tallies
 
 __all__ = ["ContextEffects", "SharedFunction", "SharedMoments", "shared_function", "shared_moments"]
@@ -67,7 +67,8 @@ def shared_function(model: PeopleModel, answers: Tallies, start: Float[Array, "M
     solved = _solved(model, answers, start, pivots)
     mode, system, weights, root = solved.mode, solved.system, solved.weights, solved.root
     rank = len(pivots.points)
-    factor = jnp.where(pivots.used[None, :], _explained(_without_effect(system.precision, rank), root), 0.0)
+    explained = solve_triangular(root, system.explained(rank).T, lower=True, trans=1).T
+    factor = jnp.where(pivots.used[None, :], jnp.pad(explained, ((0, rank - len(explained)), (0, 0))), 0.0)
 
     kernel = model.of_variance(model.shared)
     covariance = gram(kernel, pivots.points, pivots.points)
@@ -80,7 +81,7 @@ def shared_function(model: PeopleModel, answers: Tallies, start: Float[Array, "M
         tolerance=mode.tolerance,
         iterations=mode.steps,
         jitter=pivots.left,
-        condition=jnp.linalg.norm(system.precision),
+        condition=jnp.linalg.norm(system.inner),
         smallest_variance=smallest,
         variance_resolution=resolution,
         evidence_error=solved.error,
@@ -109,16 +110,13 @@ def shared_moments(
 ) -> SharedMoments:
     """Mean and variance of the shared function g at few points `x` (m, d) of the unit cube.
 
-    What `shared_function` predicts there, to rounding, without its eigendecomposition: with S = C C' the explained
-    variance is |phi|^2 - |C^-1 phi|^2 of the features phi(x). Can be traced; never raises.
+    What `shared_function` predicts there, to rounding, without an eigendecomposition. Can be traced; never raises.
     """
     solved = _solved(model, answers, start, pivots)
     mode, root, rank = solved.mode, solved.root, len(pivots.points)
-    lower = jnp.linalg.cholesky(_without_effect(solved.system.precision, rank))
 
     def left(features: Float[Array, "m r"]) -> Float[Array, " m"]:
-        rest = solve_triangular(lower, features.T, lower=True)
-        return model.shared - model.shared * (jnp.sum(features**2, axis=1) - jnp.sum(rest**2, axis=0))
+        return model.shared - model.shared * solved.system.explained_variance(features)
 
     kernel = model.of_variance(model.shared)
     covariance = gram(kernel, pivots.points, pivots.points)
@@ -197,7 +195,7 @@ def _effects_of(
     if model.effect is None:
         return None
     rank, sd = len(points), jnp.sqrt(model.effect)
-    covariance = cho_solve((system.factor, True), jnp.eye(len(together), dtype=together.dtype))
+    covariance = system.covariance()
     return ContextEffects(
         prior=model.effect,
         mean=sd * together[rank:],
@@ -206,22 +204,6 @@ def _effects_of(
         points=points,
         cross=sd * solve_triangular(root, covariance[:rank, rank:], lower=True, trans=1),
     )
-
-
-def _without_effect(precision: Float[Array, "p p"], rank: int) -> Float[Array, "r r"]:
-    """Precision (r, r) of the weights of g, with those of the effects integrated out; `rank` is r."""
-    if precision.shape[0] == rank:
-        return precision
-    cross, own = precision[:rank, rank:], precision[rank:, rank:]
-    half = solve_triangular(jnp.linalg.cholesky(own), cross.T, lower=True)
-    return precision[:rank, :rank] - half.T @ half
-
-
-def _explained(precision: Float[Array, "r r"], root: Float[Array, "r r"]) -> Float[Array, "r r"]:
-    """V with V'V = L^-T (I - S^-1) L^-1, (r, r), of precision S and root L; negative eigenvalues are taken as 0."""
-    excess, vectors = eigh(precision - jnp.eye(root.shape[0], dtype=root.dtype))
-    explained = jnp.sqrt(jnp.where(excess > 0, excess / (1.0 + excess), 0.0))  # below 0 by rounding
-    return explained[:, None] * solve_triangular(root, vectors, lower=True, trans=1).T
 
 
 def _rounding(

@@ -30,7 +30,7 @@ from hilbo.session.withdrawal.changes import (
 from hilbo.session.withdrawal.left import ending, left_below, logs
 from hilbo.session.withdrawal.results import commands_of, computed, list_again, results_folders
 from hilbo.session.withdrawal.traces import Below, files_below
-from hilbo.study.disk.lock import JOURNAL, locked_folder, withdrawal_above
+from hilbo.study.disk.lock import JOURNAL, LOCK, locked_folder, withdrawal_above
 from hilbo.study.disk.new_file import UNFINISHED, remove_unfinished, rewrite_file, write_file
 from hilbo.study.disk.new_folder import LEFTOVER, recover
 from hilbo.study.file.plan_file import plan_in
@@ -163,6 +163,7 @@ def _wait_for_others(root: Path, locks: contextlib.ExitStack) -> None:
             leftovers.append(Path(place))
         shared = (os.path.realpath(Path(place, name)) for name in names if _is_shared(Path(place, name)))
         places |= {Path(path).parent for path in shared if Path(path).is_relative_to(inside)}
+        places |= {Path(os.path.realpath(place))} if LOCK in names else set()  # a killed command's goes with ours
         folders[:] = kept
     places |= {Path(os.path.realpath(place)) for place in leftovers}
     for place in sorted(places - {inside}):

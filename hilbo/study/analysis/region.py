@@ -84,7 +84,7 @@ def optimum_region(
         return None
     functions = [each.function for each in drawn] or [map_.shared]
     report = partial(say, "parts of the region of the optimum")
-    places = best_places(study.space, study.goal, functions, seed, count, _DRAWS, report)
+    places = best_places(study.space, study.goal, functions, seed, count, _DRAWS, report, quick=True)
     first, which = _distinct(np.asarray(places.points))
     points, weight = np.asarray(places.points)[first], np.bincount(which, np.asarray(places.share))
     mean, variance = (np.asarray(each)[first] for each in predict_map(map_, places.points))

@@ -20,7 +20,7 @@ from hilbo.likelihoods import Goal
 from hilbo.numerics.host import to_device
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
-from hilbo.population.joint import posterior_map
+from hilbo.population.joint import posterior_map, quick_optima
 from hilbo.search.candidates import search_points
 from hilbo.search.space import SearchSpace
 
@@ -50,17 +50,20 @@ def best_places(
     count: int = POINTS,
     draws: int = DRAWS,
     say: Callable[[int, int], None] = lambda done, functions: None,
+    *,
+    quick: bool = False,
 ) -> BestPlaces:
     """Distribution of the optimum over `count` even points of the feasible set and a quarter as many on its walls.
 
     `functions`: equally probable posteriors, of each of which draws / number of posteriors (rounded up) are drawn. Two
     posteriors are processed at a time, in threads. `say`: called with the number of posteriors done, and of all.
+    `quick`: by `quick_optima`, for analyses that are not part of a versioned method.
     """
     points, each = search_points(space, seed, count), -(-draws // len(functions))
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
         seeds = map(to_device, range(seed, seed + len(functions)))
         shares = []
-        for share in pool.map(lambda function, seed: _shares(function, goal, points, seed, each), functions, seeds):
+        for share in pool.map(lambda function, seed: _shares(function, goal, points, seed, each, quick), functions, seeds):
             shares.append(jax.block_until_ready(share))
             say(len(shares), len(functions))
     return BestPlaces(points, sum(shares[1:], shares[0]) / len(shares))
@@ -68,11 +71,13 @@ def best_places(
 
 @program
 def _shares(
-    function: Posterior, goal: Goal, points: Float[Array, "m d"], seed: ArrayLike, draws: int
+    function: Posterior, goal: Goal, points: Float[Array, "m d"], seed: ArrayLike, draws: int, quick: bool
 ) -> Float[Array, " m"]:
     """Fraction (m,) of `draws` joint draws of one posterior that are closest to the goal at each point."""
-    closeness = partial(goal.closeness, function.gp.likelihood)
-    return posterior_map(function, points).optima(jax.random.key(seed), draws, closeness=closeness)
+    closeness, key = partial(goal.closeness, function.gp.likelihood), jax.random.key(seed)
+    if quick:
+        return quick_optima(function, points, key, draws, closeness)
+    return posterior_map(function, points).optima(key, draws, closeness=closeness)
 
 
 def nearness(
