@@ -19,7 +19,7 @@ from hilbo.study.estimate.aggregate import fit_cohort
 from hilbo.study.estimate.learnt import that_learns
 from hilbo.study.estimate.optimum import population_optimum
 from hilbo.study.robustness.optimised import fixed_and_optimised
-from hilbo.study.robustness.robustness import NEAR, robustness
+from hilbo.study.robustness.robustness import NEAR, nearby, robustness
 
 pytestmark = pytest.mark.deep
 
@@ -138,3 +138,22 @@ def test_a_rule_that_learns_is_compared_with_its_priors_medians(scene):
 def test_what_cannot_be_optimised_is_said(scene, learn, words):
     with pytest.raises(InputError, match=words):
         robustness(*scene, learn=learn)
+
+
+def test_points_near_an_optimum_are_feasible_and_keep_levels(scene):
+    study, _ = scene
+    x = jnp.asarray(study.space.candidates(1, 3)[0])
+    points = np.asarray(nearby(study.space, x, 500, 0))
+    assert np.asarray(study.space.feasible(points)).all()
+    away = np.abs(points - np.asarray(x)).max(axis=1)
+    assert away.max() < 0.25 and 0.001 < np.median(away) < 0.05
+    levels = Study.from_dict(
+        {
+            "schema": 1,
+            "study": {"name": "levels", "responses": ["bad", "good"]},
+            "parameters": {"kind": {"levels": ["a", "b", "c"]}, "gain": {"low": 0.0, "high": 1.0}},
+            "aggregation": {"rule": "learnt-2"},
+        }
+    )
+    x = jnp.asarray(levels.space.candidates(4, 0)[0])
+    assert np.all(np.asarray(nearby(levels.space, x, 50, 0))[:, 0] == float(x[0]))

@@ -63,7 +63,9 @@ def best_places(
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
         seeds = map(to_device, range(seed, seed + len(functions)))
         shares = []
-        for share in pool.map(lambda function, seed: _shares(function, goal, points, seed, each, quick), functions, seeds):
+        for share in pool.map(
+            lambda function, seed: _shares(function, goal, points, seed, each, quick), functions, seeds
+        ):
             shares.append(jax.block_until_ready(share))
             say(len(shares), len(functions))
     return BestPlaces(points, sum(shares[1:], shares[0]) / len(shares))

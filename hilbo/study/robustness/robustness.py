@@ -28,6 +28,7 @@ from hilbo.population.maps import point_rule
 from hilbo.population.rules.registry import RULES
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
+from hilbo.search.space import SearchSpace
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort
@@ -35,9 +36,9 @@ from hilbo.study.estimate.bootstrap import can_resample, resampled_tops
 from hilbo.study.estimate.optimum import Optimum, map_optimum, population_optimum, predict_people, score
 from hilbo.study.robustness.optimised import LEARNABLE, FixedAndOptimised, differentiable, fixed_and_optimised
 
-__all__ = ["LIMIT", "NEAR", "Place", "Resampled", "Robustness", "robustness"]
+__all__ = ["LIMIT", "NEAR", "Place", "Resampled", "Robustness", "nearby", "robustness"]
 
-_POINTS = 1000  # candidate points of the optimum of resampled participants
+_NEAR_POINTS, _NEARBY = 1000, (0.001, 0.2)  # points near the optimum, and their distances from it
 LIMIT = 0.03
 """NRMSE from which an optimum is flagged as not robust (paper, section IV-3)."""
 NEAR = 0.1
@@ -148,12 +149,13 @@ def _place(optimum: Optimum, goal: Goal, cohort: Cohort, levels: tuple[int, ...]
 
 
 def _resampled(fixed: tuple[Study, Aggregate], optimised: tuple[Study, Aggregate], seed: int) -> Resampled | None:
-    """Bootstrap over participants: the optima of each resample, among 1000 candidates and the optimum of all, with the
-    hyperparameters of all, point by point. None for fewer than two participants with responses."""
+    """Bootstrap over participants: the optima of each resample, among all candidates and 1,000 points near the
+    optimum of all, with the hyperparameters of all, point by point. None for fewer than two participants with
+    responses."""
     study, aggregate = fixed
     if not can_resample(aggregate.posteriors):
         return None
-    candidates, levels = search_points(study.space, seed)[:_POINTS], study.gp.kernel.levels
+    candidates, levels = search_points(study.space, seed), study.gp.kernel.levels
     (whole, tops), (_, others) = (_tops(*each, candidates, seed) for each in (fixed, optimised))
     return Resampled(np.asarray(nrmse(tops, whole, levels)), np.asarray(nrmse(others, tops, levels)))
 
@@ -162,15 +164,28 @@ def _tops(
     study: Study, aggregate: Aggregate, candidates: Float[Array, "m d"], seed: int
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "draws d"]]:
     """Optimum (d,) of all participants, aggregated point by point, and those (draws, d) of resamples of them, among the
-    candidates and the optimum of the map.
+    candidates, the optimum of the map and points near it.
     """
-    points = jnp.concatenate([aggregate.optimum.x[None, :], candidates])
+    best = aggregate.optimum.x
+    points = jnp.concatenate([best[None, :], nearby(study.space, best, _NEAR_POINTS, seed), candidates])
     rule, share = point_rule(study.rule, aggregate.map.share)
     apart = 0.0 if share is None else (1.0 - share) * study.gp.kernel.variance
     moments = predict_people(aggregate.posteriors, points, rule, share)
     whole = int(jnp.argmax(score(study.goal, study.gp.likelihood, *moments, apart)))
     tops = resampled_tops(study, aggregate.posteriors, points, rule, share, study.gp.kernel.variance, seed)
     return np.asarray(points)[whole], np.asarray(points)[tops]
+
+
+def nearby(space: SearchSpace, x: Float[Array, " d"], count: int, seed: int) -> Float[Array, "count d"]:
+    """Feasible points about `x` in the unit cube, at distances from .1 to 20 % of the range along each axis of the
+    optimiser's box, evenly on a logarithmic scale; discrete coordinates stay. Infeasible ones are replaced by `x`.
+
+    Among even points alone, the optimum of a resample would be the point itself or one that is far from it.
+    """
+    rng, box = np.random.default_rng(seed), np.asarray(space.to_box(x))
+    away = np.exp(rng.uniform(*np.log(_NEARBY), (count, 1))) * rng.uniform(-1.0, 1.0, (count, len(box)))
+    points = space.from_box(np.clip(box + np.where(space.discrete, 0.0, away), 0.0, 1.0))
+    return jnp.where(space.feasible(points)[:, None], points, x)
 
 
 def _sensitivity_of(
