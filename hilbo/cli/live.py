@@ -242,7 +242,8 @@ def live(
     study: Path, out: Path, preset: str | None, phase: str, seconds: float | None, seed: int, say: Any
 ) -> dict[str, Any]:
     """Run a whole session without people into a new folder, for `hilbo simulate --live`, and return its summary
-    (`rehearse`), which is also result.json there. Raises `InputError` if the folder is not empty, or packages or a browser are missing."""
+    (`rehearse`), which is written to result.json there. Raises `InputError` if the folder is not empty, or packages or
+    a browser are missing."""
     need_extra()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: exists already; choose another --out.")

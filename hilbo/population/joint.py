@@ -21,7 +21,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from hilbo.kernels import gram
 from hilbo.numerics.linalg import cholesky, eigh, solve_lower, solve_lower_transposed
