@@ -183,7 +183,8 @@ def nearby(space: SearchSpace, x: Float[Array, " d"], count: int, seed: int) -> 
     Among even points alone, the optimum of a resample would be the point itself or one that is far from it.
     """
     rng, box = np.random.default_rng(seed), np.asarray(space.to_box(x))
-    away = np.exp(rng.uniform(*np.log(_NEARBY), (count, 1))) * rng.uniform(-1.0, 1.0, (count, len(box)))
+    (low, high), d = np.log(_NEARBY), len(box)
+    away = np.exp(rng.uniform(low, high, (count, 1))) * rng.uniform(-1.0, 1.0, (count, d))
     points = space.from_box(np.clip(box + np.where(space.discrete, 0.0, away), 0.0, 1.0))
     return jnp.where(space.feasible(points)[:, None], points, x)
 
