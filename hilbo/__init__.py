@@ -118,6 +118,7 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str):
+    """Import a public name, or look up `__version__`, at its first use. Raises AttributeError for any other name."""
     if name == "__version__":
         from importlib.metadata import version  # slow to import, and rarely needed
 

@@ -150,6 +150,7 @@ def _merged(
 ) -> tuple[_Map, Bool[Array, " m"]]:
     """Population map of the committee machine, NaN at invalid points; and the mask (m,) of invalid points. `explained`:
     prior minus posterior variance; `prior`: prior variance.
+
     Invalid: a present participant has a mean that is not finite or a variance that is not positive, or the total
     precision is not positive.
     """

@@ -53,9 +53,8 @@ def maximise_judged(
 
     `learn`: names of hyperparameters; `shared`: the same for all participants, else individual ones; `weak_priors`: as
     for `maximise_evidence`; `inference`: method of the evidence; with another than "laplace" nothing is checked, and
-    the error is 0. Not under `jit`: what is
-    learnt again depends on values. Raises `InputError` for unknown or no names in `learn`, for variance, noise and
-    thresholds together, and for exact inference.
+    the error is 0. Not under `jit`: what is learnt again depends on values. Raises `InputError` for unknown or no names
+    in `learn`, for variance, noise and thresholds together, and for exact inference.
     """
     settings = (tuple(learn), shared, weak_priors)
     maximum = _learnt(gp, trials, *settings, inference)

@@ -88,7 +88,8 @@ def simulate_power(
     `jobs`: number of processes, by default that of the cores. All are new processes, even a single one, so that a
     script must guard its main part with `if __name__ == "__main__":`. Each calls `begin` first (float64, a cache), if
     given; otherwise it computes with JAX's defaults. `say` receives the number of (m, t) done in all studies, and of
-    all. Raises `InputError` for numbers of participants or responses that the study's method cannot aggregate.
+    all. Raises `InputError` for a study without a single optimum (a goal between other responses and several
+    parameters), and for numbers of participants or responses that the study's method cannot aggregate.
     """
     if not study.one_optimum:
         raise InputError(

@@ -59,7 +59,8 @@ def ordered_logit(
     """Ordered logit of categories (n,), ints from 0, on the columns of `predictors` (no constant).
 
     `categories` names them, lowest first; the edge between two is the term "a|b". A category that never occurs has no
-    edge of its own; raises `InputError` if fewer than two occur.
+    edge of its own. Raises `InputError` for categories that are no such list or have no name, if fewer than two occur,
+    and as `binary_logit`.
     """
     check_aligned(category=category, predictors=predictors, clusters=clusters)
     answers = np.asarray(category)
@@ -96,7 +97,7 @@ def tied_preferences(
     comparison; the strength of `reference` (default: the last in the alphabet) is 0. `order` (+1 if `first` was shown
     first, -1 if not, 0 if not known) adds the term "shown first".
     All sequences are (n,), one entry a comparison. Raises `InputError` for a preference that is neither set nor a tie,
-    for a set called "tie", and for a `reference` that is in no comparison.
+    for a set called "tie", for a `reference` that is in no comparison, and for another `order`.
     """
     check_aligned(first=first, second=second, preferred=preferred, clusters=clusters, order=order)
     left, right, chosen = (np.asarray(column, str) for column in (first, second, preferred))

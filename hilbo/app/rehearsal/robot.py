@@ -144,8 +144,8 @@ class Participant:
         return self.window.evaluate("!!(view && view.step && ['a', 'b'].includes(view.step.show))")
 
     def _answer(self) -> None:
-        """Answer all open questions by the number keys, each once the page accepts keys; stops if a question is gone,
-        and does nothing without a pending trial."""
+        """Answer all open questions by the number keys, each once the page accepts keys, and count the trial in
+        `answered`; stops if a question is gone, and does nothing without a pending trial."""
         trial = self._pending()
         if trial is None:
             return

@@ -54,7 +54,8 @@ def parameters_of(study: StudyFile) -> list[dict[str, Any]]:
 
 
 def _parameter(study: StudyFile, p: Parameter) -> dict[str, Any]:
-    """One parameter of `parameters_of`."""
+    """One parameter of `parameters_of`: `name` and `levels`, or `name`, `unit`, `low`, `high`, `tolerance` (at the low
+    end, in the unit) and, on a logarithmic scale, `share` (the same as a fraction of the value)."""
     assert study.stimulus is not None
     if p.levels:
         return {"name": p.name, "levels": list(p.levels)}

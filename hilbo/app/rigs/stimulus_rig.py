@@ -274,7 +274,8 @@ class StimulusRig:
             await self._wait_for(self._moved, end - time.monotonic())
 
     async def clear(self) -> None:
-        """Leave an acknowledged stop. Raises `RuntimeError` before the acknowledgement, or if no program is there."""
+        """Leave an acknowledged stop; nothing without a stop. Raises `RuntimeError` before the acknowledgement, or if
+        no program is there."""
         self._check_present()
         if self.snapshot.state == "ESTOP":
             if self._stop_s is None:

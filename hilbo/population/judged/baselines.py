@@ -27,7 +27,8 @@ def constant(
     observed: Bool[np.ndarray, " n"],
     person: Int[np.ndarray, " n"] | None = None,
 ) -> Float[np.ndarray, "n C"]:
-    """Class probabilities (n, C) from the categories `q` (n,) of the rows that are `observed` (n,).
+    """Class probabilities (n, C) from the categories `q` (n,) of the rows that are `observed` (n,), each category
+    counted half a time more.
 
     `person` (n,): whose row it is, a person's rows in the order of presentation; None: without intercepts, equal in all
     rows.

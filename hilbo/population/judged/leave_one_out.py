@@ -197,8 +197,8 @@ def integral_transform(
 def normal_scores(
     probabilities: Float[np.ndarray, "n C"], q: Int[np.ndarray, " n"], seed: int = 0
 ) -> Float[np.ndarray, " n"]:
-    """Normal scores Phi^-1(u) (n,) of the transform, each from the smaller of its tails, so that large ones stay
-    finite.
+    """Normal scores Phi^-1(u) (n,) of the probability integral transform of the responses `q`, randomised within each
+    response by `seed`; each from the smaller of its tails, so that large ones stay finite.
     """
     n, v = np.arange(len(q)), np.random.default_rng(seed).uniform(size=len(q))
     chance = probabilities[n, q]

@@ -87,8 +87,8 @@ class _Individual(NamedTuple):
 def _individual(
     learnt: Learnt, own: list[str], trials: Trials, categories: int, stated: Stated, recipe: Recipe
 ) -> _Individual:
-    """Log factors, those named in `own`, of participants outside the sample, with the other hyperparameters of `learnt`
-    fixed.
+    """Log factors, those named in `own`, of participants outside the sample, with their standard deviations and whether
+    the search ended; the other hyperparameters of `learnt` are fixed.
     """
     answers = tallied(trials, categories)
     start = learnt.coordinates | {name: jnp.zeros(len(trials.mask)) for name in own}

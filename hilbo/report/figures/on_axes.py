@@ -39,7 +39,7 @@ def plot_map(
 
     **Returns:** the axes. Infeasible stimuli are left white, the maximum is a star; the values of the other parameters
     are in the title, but those that an equality determines. Raises `InputError` for parameters that the study does not
-    have, and for a model of another type.
+    have, for a pair that an equality makes dependent, and for a model of another type.
     """
     names, free = study.space.names, study.space.free
     axes = _new_axes() if ax is None else ax

@@ -141,8 +141,8 @@ def label_axes(axes, study: Study, i: int, j: int) -> None:
 
 
 def _steps_on(axes, which, parameter) -> None:
-    """Set limits and ticks of one axis (`which`: "x" or "y") for a discrete parameter: half a step of margin, and the
-    names of levels.
+    """Set limits and ticks of one axis (`which`: "x" or "y") for a discrete parameter: half a step of margin (below the
+    low end only on a linear scale), and the names of levels or whole numbers.
     """
     getattr(axes, f"set_{which}lim")(parameter.low - 0.5 * (parameter.scale == "linear"), parameter.high + 0.5)
     if parameter.levels:

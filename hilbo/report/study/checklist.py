@@ -114,7 +114,7 @@ def _posterior(analysis, content):
 
 def _prediction(content, validated):
     """Sentence with the cross-validated cost of the map and of constant proportions, and whether there was a
-    validation.
+    validation; without a model check, that there are too few participants.
     """
     check = content["model_check"]
     if check is None:

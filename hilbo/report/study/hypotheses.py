@@ -194,7 +194,7 @@ def _population(results):
 
 def _likeliest(analysis):
     """Evidence whether a new participant's likeliest response at the optimum is the goal, with all of its
-    probability's 95 % interval.
+    probability's 95 % interval; inconclusive for methods that do not predict a new participant.
     """
     highest, goal = analysis.population.highest, analysis.study.goal
     if highest is None:

@@ -94,8 +94,9 @@ def tolerance_table(analysis: Analysis) -> pd.DataFrame:
 
 
 def alternatives_table(analysis: Analysis) -> pd.DataFrame:
-    """All estimates that could be presented as the optimum, a row each: parameters, latent score (mean, sd),
-    probability of the goal, and with mechanics the passivity margin (N·s/m; negative is not passive).
+    """All estimates that could be presented as the optimum (name in `optimum`), a row each: parameters, latent score
+    (`mean`, `sd`), probability of the goal (`p_top`), and with mechanics `passivity_margin` (N·s/m; negative is not
+    passive).
 
     Means of optima and sets have no score. Only methods that predict a new participant (`Rule.predicts`) have the
     probability.

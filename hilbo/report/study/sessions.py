@@ -50,7 +50,7 @@ def described(people: Mapping[str, Mapping[str, str]], names: Sequence[str]) -> 
 
 
 def _minutes(held: Sequence[SessionRow]) -> str:
-    """Median, smallest and largest duration in minutes, as text."""
+    """Median, smallest and largest duration in minutes, as text; "–" without sessions that have both times."""
     times = [(s.ended_at - s.began_at) / 60 for s in held if s.began_at is not None and s.ended_at is not None]
     if not times:
         return "–"

@@ -159,7 +159,8 @@ def answer(
 
 
 def undo(state: LiveSession, at: float, reason: str = "") -> Event:
-    """Event that takes back the last answer; its trial is asked again. Raises `RefusedError` if there is none."""
+    """Event that takes back the last answer; its trial is asked again. Raises `RefusedError` if there is none, and
+    after an abort."""
     _running(state)
     last = state.last_answered
     if last is None:
@@ -171,7 +172,7 @@ def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
     """Event that restarts the pending trial (`trial` None, or its id), or presents an answered one again later, as a
     check of consistency. The answer to such a repetition has the phase "repeat" and is never fitted.
 
-    Raises `RefusedError` if there is no such trial, or it is an answered repetition itself.
+    Raises `RefusedError` if there is no such trial, or it is an answered repetition itself, and after an abort.
     """
     _running(state)
     repeated = state.pending if trial is None else state.trial(trial)
@@ -184,7 +185,7 @@ def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
 
 def void(state: LiveSession, trial: int, reason: str, at: float) -> Event:
     """Event: a pending or answered trial shall not count; it is asked again. Unlike stops of the device, voiding a
-    rendering never excludes it. Raises `RefusedError` if the trial does not count already."""
+    rendering never excludes it. Raises `RefusedError` if the trial does not count already, and after an abort."""
     _running(state)
     voided = state.trial(trial)
     if voided.status not in ("pending", "answered"):
@@ -193,8 +194,8 @@ def void(state: LiveSession, trial: int, reason: str, at: float) -> Event:
 
 
 def restore(state: LiveSession, trial: int, at: float) -> Event:
-    """Event: a voided answer shall count after all. Raises RefusedError if it is none, or another answer has its
-    place."""
+    """Event: a voided answer shall count after all. Raises RefusedError if it is none, if another answer has its
+    place, and after an abort."""
     _running(state)
     voided = state.trial(trial)
     if voided.status != "void" or voided.values is None:
@@ -208,7 +209,7 @@ def skip(state: LiveSession, reason: str, at: float, trial: int | None = None) -
     """Event: the pending planned trial, which the device has stopped twice, is left out for good; `trial` is its id, or
     None.
 
-    Raises RefusedError if there is no such trial.
+    Raises RefusedError if there is no such trial, and after an abort.
     """
     _running(state)
     skipped = state.skippable
@@ -252,7 +253,7 @@ def pause(state: LiveSession, by: str, at: float) -> Event:
 
 
 def resume(state: LiveSession, at: float) -> Event:
-    """Event that ends a break. Raises `RefusedError` if there is none."""
+    """Event that ends a break. Raises `RefusedError` if there is none, and after an abort."""
     _running(state)
     if state.paused is None:
         raise RefusedError("nothing", "the session is not paused.")

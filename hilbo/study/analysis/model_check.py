@@ -34,8 +34,12 @@ _GROUPS = 12  # of people, in which the baselines leave them out
 
 
 def model_check(study: Study, aggregate: Aggregate, say: SayCount = silent) -> Content | None:
-    """Results of the model check as a dict for result.json; None for fewer than three participants with responses.
-    `say`: progress."""
+    """Results of the model check by cross-validation, as a dict for result.json; None for fewer than three participants
+    with responses. `say`: progress.
+
+    Keys: "hyperparameters" (specified or learnt), "shares" of the responses, also "by_third" of a session and
+    "by_person", "repeats" (test-retest agreement), "not_converged" and "negative_log_density".
+    """
     cohort = aggregate.cohort
     answered = np.flatnonzero(cohort.counts() > 0)
     if len(answered) < 3:

@@ -148,7 +148,8 @@ def _extent(parameter: Parameter, values: Float[np.ndarray, " k"]) -> list[float
 
 def region_sentences(region: Region | None, one_optimum: bool = True) -> list[str]:
     """Warnings: the optimum is not located (region above a quarter of the space), and it may be at another mode
-    (probability above 0.2). Empty for no region. `one_optimum`: of the study."""
+    (probability above 0.2). Empty for no region. Without `one_optimum` (of the study) one sentence on the region's size
+    instead."""
     if region is None:
         return []
     sentences = []

@@ -159,7 +159,7 @@ def box_of(tables: Tables) -> Box:
 
 
 def _parameter(name: str, table: ParameterTable | LevelsTable) -> Parameter:
-    """The parameter of one table of [parameters]."""
+    """The parameter of one table of [parameters]. Raises `InputError` for an invalid range, scale or levels."""
     if isinstance(table, LevelsTable):
         fields = msgspec.structs.asdict(table)
         return Parameter.of_levels(name, **fields)

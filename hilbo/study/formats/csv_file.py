@@ -59,7 +59,7 @@ def cell_pieces(
 
 def cells_of(frame: pd.DataFrame) -> pd.DataFrame:
     """The cells of a DataFrame as text, "" for missing values, with its rows numbered from 1. Raises `InputError` for
-    another type, and for repeated or too many columns."""
+    another type, and for repeated, too many or multi-level columns."""
     if not isinstance(frame, pd.DataFrame):
         raise InputError(f"{FRAME}: this is a {type(frame).__name__}; give a pandas DataFrame.")
     if frame.columns.nlevels > 1:

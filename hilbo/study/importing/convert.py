@@ -170,7 +170,8 @@ def _check_marks(part: pd.DataFrame, names: Sequence[str], mapping: Mapping, sou
 
 
 def _value(cell: str, parameter: Parameter, mapping: Mapping, where: str) -> str:
-    """A parameter's cell as the text of a number in the study's unit, or as a level's name. Raises `InputError`."""
+    """A parameter's cell without its unit as the text of a number in the study's unit, or as a level's name. Raises
+    `InputError` for a text that has to be multiplied by a factor and is no number; other texts are not checked."""
     if parameter.levels:
         return mapping.levels.get(parameter.name, {}).get(cell, cell)
     text = cell.removesuffix(parameter.unit).rstrip() if parameter.unit else cell

@@ -115,8 +115,8 @@ def _distinct(names: Sequence[str]) -> tuple[list[str], str]:
 
 
 def _sheet_rows(content: bytes, path: str) -> tuple[list[int], list[list[str]]]:
-    """Row numbers and rows of a spreadsheet's only sheet with cells as text. Raises `InputError` for several such
-    sheets, and if openpyxl is not installed."""
+    """Row numbers and rows of a spreadsheet's only sheet with cells, as text, all of one length. Raises `InputError`
+    for several such sheets, a file that is no spreadsheet, and if openpyxl is not installed."""
     try:
         from openpyxl import load_workbook
     except ImportError as error:

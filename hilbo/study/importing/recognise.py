@@ -91,8 +91,9 @@ def _participant(seen: _Seen, files: int, questions: list[str]) -> str:
 
 
 def _trials(seen: _Seen, study: StudyFile, participant: str, questions: list[str]) -> dict[str, str]:
-    """The columns of response, trial and parameters: of a table with a row for each trial, else of one with a row for
-    each participant. Adds questions for missing items."""
+    """Key of [columns] ("response", "trial", "stimulus", parameter names) -> column or pattern, "" where it is not
+    certain: of a table with a row for each trial, else of one with a row for each participant. Appends a question on
+    each uncertain one to `questions`."""
     by_name = {p.name: _parameter(seen, p) for p in study.space.parameters}
     given = [column for columns in by_name.values() for column in columns]
     levels = {column: p.levels for p in study.space.parameters for column in by_name[p.name]}

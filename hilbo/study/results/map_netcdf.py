@@ -88,7 +88,7 @@ def _in_blocks(
 
 
 def _map_at_points(study: Study, surface: Callable[..., Any], seed: int = 0) -> xr.Dataset:
-    """The map at points that fill the feasible set; levels by name. `surface`: as in `map_dataset`."""
+    """The map at points that fill the feasible set, drawn by `seed`; levels by name. `surface`: as in `map_dataset`."""
     x = search_points(study.space, seed)
     mean, variance = (np.asarray(moment) for moment in surface(np.asarray(x)))
     physical = np.asarray(study.space.to_physical(x)).T.tolist()
