@@ -35,8 +35,8 @@ def put_in_force(link: Link, device: HelloReply, wanted: Sequence[SetParams | Se
 
 
 def _stage(link: Link, device: HelloReply, messages: Sequence[SetParams | SetStates], give_up: float) -> None:
-    """Send all messages of a set, waiting while the device is busy, until `give_up` (s, monotonic). Raises
-    `DeviceError` if the CRC in an answer shows that the device received something else, and as `retry_while_busy`."""
+    """Send all messages of a set, waiting while the device is busy. Raises `DeviceError` if the CRC in an answer shows
+    that the device received something else, and as `retry_while_busy`, with the same `give_up`."""
     for count, message in enumerate(messages, 1):
         answer = retry_while_busy(link, device, message, give_up)
         if answer.crc != crc_of(messages[:count]):

@@ -22,9 +22,8 @@ def scrambled_sobol(
     """Independent scrambles (`replicates`) of the first `count` points of Sobol's sequence, in (0, 1)^dim. Raises
     `InputError` if `count` is not a power of 2, 2 or more.
 
-    A random lower triangular bit matrix times the generators of each
-    dimension, and a random shift: every point is uniform, and the points of a scramble have the sequence's low
-    discrepancy.
+    A random lower triangular bit matrix times the generators of each dimension, and a random shift: every point is
+    uniform, and the points of a scramble have the sequence's low discrepancy.
     """
     bits = min(30, jnp.finfo(dtype).nmant)
     generators = jnp.asarray(_generators(count, dim, bits))  # (levels, dim)

@@ -118,8 +118,8 @@ def read_trials(
     **Arguments:** `path`: a CSV or Parquet file. `material`: select its rows; required if the table has several.
     `mapping`: the mapping file of `hilbo import`, or its content, by which another program's export is converted first.
     `others`: keep the columns that hilbo does not use. `say`: called with the number of rows read so far. `note`:
-    called with one sentence on participants none of whose responses is fitted, and one on ids that differ in capitals
-    only; by default a warning. Raises `InputError`.
+    called with one sentence on each of: participants none of whose responses is fitted, two ids that may be one
+    participant's, ids that a spreadsheet has rounded, missing responses; by default a warning. Raises `InputError`.
     """
     cells = cell_pieces(path) if mapping is None else [_converted(path, study, mapping, note)]
     table = trial_table(cells, study.file, material, source=str(path), others=others, say=say, note=note)

@@ -117,7 +117,8 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
 
 
 def _with_exclusion(study: Study, exclude: str | None) -> Study:
-    """The study with another exclusion rule, rebuilt and checked; the same study for None."""
+    """The study with another exclusion rule, rebuilt and checked; the same study for None. Raises `InputError` for an
+    invalid rule."""
     if exclude is None:
         return study
     content = {"schema": 1} | json.loads(study.file.content)

@@ -265,9 +265,8 @@ class Hub:
     async def press(self, what: str, message: Press, page: str | None) -> None:
         """Carry out a participant's button `what`: "break", "more" (another warm-up trial), "here" (sign of life of the
         page), else begin: start the next block after the warm-up, or else let the runner present. `page` as in
-        `answer`.
-        Raises `NotNowError`, also for a button that was pressed during another trial or presentation than the present
-        one; `LogError`."""
+        `answer`. Raises `NotNowError`, also for a button that was pressed during another trial or presentation than the
+        present one; `LogError`."""
         self._check_page(page)
         if what == "here":
             self.watchers.alive(page)

@@ -158,9 +158,10 @@ def rehearse(
     (`mishaps`), names of screenshots, path of the log, number of events.
 
     Writes study.toml, the log, screenshots of both pages, and for another phase than optimisation plan.json into `out`.
-    `seconds` and `warm_up`: duration of every step and number of warm-up trials, by default the study's, as is
-    `preset`, the population; `say`: called with each stage. Of several materials the first is taken. Raises
-    `InputError` for a study that is refused, before `out` is made, and `RuntimeError` if the server does not start.
+    `seconds`: duration of every step, by default the study's; `warm_up`: number of warm-up trials, only with `seconds`
+    and for a study that does not state its warm-up; `preset`: population, by default the study's; `say`: called with
+    each stage. Of several materials the first is taken. Raises `InputError` for a study that is refused, before `out`
+    is made, and `RuntimeError` if the server does not start.
     """
     Study.load(source)  # a refusal leaves no folder behind
     out.mkdir(parents=True, exist_ok=True)

@@ -61,7 +61,7 @@ def with_distinct_times(
 
 
 def _last_digit(cell: str) -> float:
-    """Value of one unit in the last digit of a number as it is written: 0.01 for 3.20, 10 for 1.2e2."""
+    """Value of one unit in the last digit of a number as written: 0.01 for 3.20, 10 for 1.2e2; 0 for no number."""
     match = _NUMBER.fullmatch(cell.strip())
     if match is None:
         return 0.0

@@ -221,8 +221,8 @@ def clustered(values: Float[np.ndarray, " n"], person: Int[np.ndarray, " n"]) ->
 
 
 def calibration(left: LeftOut, seed: int = 0) -> dict[str, float]:
-    """Mean cost (`negative_log_density`), share in the central 95 % (`central_95`) and `z2`; and the standard error of
-    each, clustered by participant, under NAME_error.
+    """Mean cost (`negative_log_density`), share in the central 95 % (`central_95`) and mean squared normal score
+    (`z2`); and the standard error of each, clustered by participant, under NAME_error.
     """
     u = integral_transform(left.probabilities, left.q, seed)
     parts = {

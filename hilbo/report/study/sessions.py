@@ -27,8 +27,9 @@ def session_rows(held: Sequence[SessionRow]) -> list[list[str]]:
 
 
 def described(people: Mapping[str, Mapping[str, str]], names: Sequence[str]) -> Content:
-    """Ages and handedness of the participants `names`: numbers for result.json, and `words` for the page. `people`:
-    participant -> row of participants.csv; rows of others are not considered, nor cells that are empty."""
+    """Ages and handedness of the participants `names`: `participants` (number), `mean_age` (years, None if unknown) and
+    `handedness` (counts) for result.json, and `words` for the page. `people`: participant -> row of participants.csv;
+    rows of others are not considered, nor cells that are empty."""
     rows = [people[name] for name in names if name in people]
     ages = [int(row["age"]) for row in rows if row.get("age")]
     hands = Counter(row["handedness"] for row in rows if row.get("handedness"))
