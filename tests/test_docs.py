@@ -1,5 +1,6 @@
 """The pages of docs/: each is in the site's navigation, and what they link to is there. `make docs` builds the site."""
 
+import html
 import importlib.util
 import json
 import re
@@ -262,6 +263,21 @@ def test_a_small_haptic_study_runs_by_the_commands_of_its_page(tmp_path):
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     assert list(report["materials"]) == ["foam", "medium", "stiff"]
     assert page.count("Nothing departs from the plan") == 3
+    check_places_of_the_papers_numbers(tmp_path)
+
+
+def check_places_of_the_papers_numbers(folder):
+    """What docs/results/paper.md sets in italics is on the page of a report, in its first section on that of an
+    identification; files that it names exist."""
+    first, *others = (DOCS / "results" / "paper.md").read_text(encoding="utf-8").split("\n## ")[1:]
+    for sections, page in (([first], folder / "foam"), (others, folder / "report")):
+        text = re.sub(r"<[^>]*>", " ", (page / "report.html").read_text(encoding="utf-8"))
+        text = " ".join(html.unescape(text).split())
+        places = [row.split("|")[3] for section in sections for row in section.splitlines() if row.count("|") == 5]
+        words = [word for place in places for word in re.findall(r"\*([^*]+)\*", place)]
+        files = {name for place in places for name in re.findall(r"`(\w+\.(?:csv|toml))`", place)}
+        assert words and [word for word in words if word not in text] == []
+        assert files and [name for name in files if not [*page.rglob(name)]] == []
 
 
 def test_the_data_dictionary_is_that_of_the_code():
