@@ -26,7 +26,7 @@ from hilbo.study.config import Study
 from hilbo.study.formats.csv_file import read_cells
 from hilbo.study.formats.json_file import Content
 from hilbo.study.tables.flag_counts import flag_counts, flag_sentences_of
-from hilbo.study.tables.validation import RESPONSES, TIE, check_validation, of_material, read_validation, sets_frame
+from hilbo.study.tables.validation import RESPONSES, TIE, check_validation, of_material, read_validation, sets_of_study
 
 __all__ = [
     "Validated",
@@ -250,7 +250,7 @@ def write_validation(
     """
     say("reading")
     table = _read(path, study, material)
-    sets_by_id = None if sets is None else sets_frame(sets, study.space.names, study.space.parameters)
+    sets_by_id = None if sets is None else sets_of_study(sets, study.file)
     contents, sections = [], []
     names = materials_of(table)
     folders = folder_names(names)

@@ -34,7 +34,7 @@ from hilbo.study.tables.flag_counts import flag_counts
 from hilbo.study.tables.missing import Missing
 from hilbo.study.tables.sessions import SessionRow, read_session_table
 from hilbo.study.tables.trials import NothingToFitError, TrialTable, check_texts, joined, trial_table
-from hilbo.study.tables.validation import check_validation, sets_frame
+from hilbo.study.tables.validation import check_validation, sets_of_study
 
 __all__ = ["Material", "Reference", "StudyFolder", "read_folder"]
 
@@ -142,7 +142,7 @@ def _sets(paths: list[Path], study: Study) -> pd.DataFrame | None:
     for a `set_id` in two tables."""
     if not paths:
         return None
-    whole = pd.concat([sets_frame(path, study.space.names, study.space.parameters) for path in paths])
+    whole = pd.concat([sets_of_study(path, study.file) for path in paths])
     again = whole.index[whole.index.duplicated()]
     if len(again):
         raise InputError(f'{paths[0].parent}: the set "{again[0]}" is in two sets tables; keep one.')

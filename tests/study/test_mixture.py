@@ -18,6 +18,7 @@ from hilbo.study.config import Study
 from hilbo.study.estimate.location import location_sentences
 from hilbo.study.file.constraint_words import constraint_of
 from hilbo.study.results.map_netcdf import on_grid
+from hilbo.study.tables.validation import sets_of_study
 from hilbo.study.template import NewStudy, parameter_of, study_text
 
 FILE = """\
@@ -77,6 +78,31 @@ def test_rows_within_the_tolerance_of_a_program_are_read(tmp_path):
     (tmp_path / "study.toml").write_text(FILE + "[stimulus]\ntolerance = {lemon = 4.0, sugar = 3.0}\n")
     (tmp_path / "t.csv").write_text("participant,trial,response,lemon,sugar,water\nA,1,like,24,23,60\n")
     assert len(read_trials(tmp_path / "t.csv", Study.load(tmp_path / "study.toml"))) == 1
+
+
+def test_a_set_that_violates_the_equality_is_refused_with_its_name(study, tmp_path, capsys, monkeypatch):
+    head = "set_id,source,lemon,sugar,water\nbest,aggregate,33.3,33.3,33.3\n"
+    (tmp_path / "sets.csv").write_text(head + "mid,aggregate,10,60,30\n")
+    assert list(sets_of_study(tmp_path / "sets.csv", study.file).index) == ["best", "mid"]
+    (tmp_path / "sets.csv").write_text(head + "mid,aggregate,10,50,30\n")
+    (tmp_path / "v.csv").write_text(
+        "participant,trial,set_a,set_b,first,class_a,class_b,preferred\nA,1,best,mid,a,like,like,a\n"
+    )
+    files = "--study", tmp_path / "study.toml", "--sets", tmp_path / "sets.csv", "--out", tmp_path / "o"
+    code, _, text = run(capsys, monkeypatch, "validate", tmp_path / "v.csv", *files)
+    sentence = 'sets.csv: the set "mid": lemon + sugar + water is 90; it must be 100 in this study.'
+    assert code == 2 and sentence in " ".join(text.split()) and not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(("water", "accepted"), [(30.0, True), (30.05, True), (20.0, False)])
+def test_a_presented_stimulus_satisfies_the_equality(study, water, accepted):
+    session, at = Session.start(study, seed=0), {"lemon": 10.0, "sugar": 60.0, "water": water}
+    if accepted:
+        assert session.tell("like", at=at).points.tolist() == [[10.0, 60.0, water]]
+        return
+    with pytest.raises(InputError, match=r"Session: lemon \+ sugar \+ water is 90; it must be 100 in this study\."):
+        session.tell("like", at=at)
+    assert len(session.answers) == 0
 
 
 def test_a_truth_that_violates_the_equality_is_refused(tmp_path, capsys, monkeypatch):

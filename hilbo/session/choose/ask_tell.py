@@ -27,6 +27,7 @@ from hilbo.search.box import Parameter
 from hilbo.session.choose.selection import Design, design
 from hilbo.session.choose.step import Step, padding
 from hilbo.study.config import Study
+from hilbo.study.tables.equalities import broken_equality
 
 __all__ = ["Session", "physical_trials"]
 
@@ -140,8 +141,8 @@ class Session:
         unchanged.
 
         `at`: the rendering that was really presented, if it differs: each parameter's value by its name, as `ask` has
-        one, or a row of a DataFrame. Raises `InputError` for an unknown `response`, a rendering with other parameters
-        or values out of range, and once all trials are answered.
+        one, or a row of a DataFrame. Raises `InputError` for an unknown `response`, a rendering with other parameters,
+        values out of range or a violated equality of the study, and once all trials are answered.
         """
         step = self.step
         if response not in step.responses:
@@ -161,8 +162,8 @@ class Session:
         return {p.name: p.shown(value) if p.levels else value for p, value in values}
 
     def _point(self, at: Mapping[str, Any] | pd.Series) -> np.ndarray:
-        """Convert a rendering that was presented to numbers (d,). Raises `InputError` for other parameters or values
-        out of range."""
+        """Convert a rendering that was presented to numbers (d,). Raises `InputError` for other parameters, values out
+        of range, or an equality of the study that is violated."""
         names = ", ".join(self.step.names)
         if not isinstance(at, Mapping | pd.Series):
             raise InputError(f"Session: at is a {type(at).__name__}; give a dict with a value for each of {names}.")
@@ -175,7 +176,11 @@ class Session:
                 raise InputError(f"Session: {p.name} is {value!r}; give a number.")
             if not p.holds(_in_its_digits(p, value)):
                 raise InputError(f"Session: {p.name} is {value}; it must be {p.range_words}.")
-        return np.array([_in_its_digits(p, at[p.name]) for p in self.study.space.parameters])
+        point = {p.name: _in_its_digits(p, at[p.name]) for p in self.study.space.parameters}
+        broken = broken_equality(point, self.study.file)
+        if broken is not None:
+            raise InputError(f"Session: {broken}")
+        return np.array(list(point.values()))
 
     def posterior(self) -> Posterior:
         """Fit the answers so far, and return the participant's posterior."""

@@ -17,12 +17,23 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.search.box import Parameter
+from hilbo.study.file.reading import StudyFile
 from hilbo.study.formats.csv_file import answer_forms, numbers, read_cells, refuse
+from hilbo.study.tables.equalities import broken_equality
 from hilbo.study.tables.flag_counts import counted_flags, flagged, with_flag_counts
 from hilbo.study.tables.parameter_sets import read_sets
 from hilbo.study.tables.trials import boolean_column, check_people, check_texts, is_fitted
 
-__all__ = ["NONE", "RESPONSES", "TIE", "check_validation", "of_material", "read_validation", "sets_frame"]
+__all__ = [
+    "NONE",
+    "RESPONSES",
+    "TIE",
+    "check_validation",
+    "of_material",
+    "read_validation",
+    "sets_frame",
+    "sets_of_study",
+]
 
 RESPONSES = ("different", "similar", "close")
 TIE = "tie"
@@ -158,6 +169,17 @@ def sets_frame(
         frame[p.name] = [p.number(value) for value in frame[p.name]]
     text = frame.select_dtypes(exclude="number").columns
     return frame.fillna(dict.fromkeys(text, ""))
+
+
+def sets_of_study(path: str | os.PathLike, study: StudyFile) -> pd.DataFrame:
+    """Read the sets table of a study (`sets_frame`). Raises `InputError` also for a set that violates an equality of
+    the study."""
+    frame = sets_frame(path, study.space.names, study.space.parameters)
+    for row, values in zip(frame.index, frame[list(study.space.names)].to_dict("records"), strict=True):
+        broken = broken_equality({str(name): value for name, value in values.items()}, study)
+        if broken is not None:
+            raise InputError(f'{path}: the set "{row}": {broken}')
+    return frame
 
 
 def _classes(text: pd.DataFrame, column: str, responses: Sequence[str], source: str) -> pd.Series:
