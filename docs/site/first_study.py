@@ -87,7 +87,7 @@ shows their distance.""",
         figures=(
             (
                 "report/population-convergence.png",
-                "Convergence: to the last place of the optimum, and between halves of the people.",
+                "Convergence: to the last place of the optimum, and between split halves.",
             ),
             ("report/classes.png", "The likeliest answer of a new participant, and tolerance intervals."),
         ),

@@ -1,6 +1,8 @@
 """HTML and Markdown pages of results, from the Jinja templates of this folder, and the filters of the templates."""
 
-from collections.abc import Iterable, Mapping
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from itertools import islice
 from typing import Any
@@ -9,6 +11,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from hilbo.population.rules.registry import RECOMMENDED, RULES
+from hilbo.report.digits import parameter_text, parameter_texts
 from hilbo.report.kernel_words import covariance_words, formula
 from hilbo.report.participants import People
 from hilbo.study.config import Study
@@ -81,6 +84,21 @@ def estimate_words(name: str, rule: str) -> str:
     return f"population map ({rule})" if name == "aggregate" else _ESTIMATES[name]
 
 
+def footnotes(sentences: Sequence[str], names: Sequence[str]) -> dict[str, list[int]]:
+    """Numbers (from 1) of the warnings `sentences` by what on the result card they concern: a parameter of `names`,
+    "region" or "optimum".
+
+    A sentence about the limits that the optimum lies on concerns the parameters that it names.
+    """
+    marks: dict[str, list[int]] = {}
+    for k, text in enumerate(sentences, 1):
+        named = [name for name in names if re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text)]
+        limit = text.startswith(("The optimum is at ", "The optimum is on "))
+        for what in named if limit and named else ["region" if "credible region" in text else "optimum"]:
+            marks.setdefault(what, []).append(k)
+    return marks
+
+
 def rendered(name: str, **facts: Any) -> str:
     """The HTML of a template; the values `facts` are escaped. Raises an error of Jinja for a name that is missing."""
     return _environment().get_template(name).render(**facts)
@@ -104,7 +122,6 @@ def _environment() -> Environment:
     )
     environment.filters |= {
         "number": number,
-        "extent": _extent,
         "ends": _ends,
         "as_toml": _as_toml,
         "percent": percent,
@@ -113,7 +130,14 @@ def _environment() -> Environment:
         "each": _each,
         "listed": _listed,
     }
-    environment.globals |= {"heads": heads, "zip": zip, "estimate_words": estimate_words}
+    environment.globals |= {
+        "heads": heads,
+        "zip": zip,
+        "nan": math.nan,
+        "estimate_words": estimate_words,
+        "width": width,
+    }
+    environment.globals |= {"shown": parameter_text, "listing": parameter_texts, "footnotes": footnotes}
     environment.globals |= {"covariance_words": covariance_words, "formula": formula, "recommended": RECOMMENDED}
     environment.globals["predicting"] = next(rule.name for rule in RULES.values() if rule.predicts)
     return environment
@@ -144,22 +168,17 @@ def number(value: float | str) -> str:
     return np.format_float_positional(value, precision=4, unique=False, fractional=False, trim="-")
 
 
-def _extent(values: list[float | str]) -> str:
-    """Range of a parameter's values as text: "from 1 to 2" for the two ends `values`, "= 1" if they are equal, and "= a
-    or b" for names of levels.
-    """
-    if isinstance(values[0], str) or values[0] == values[1]:
-        return "= " + " or ".join(map(number, dict.fromkeys(values)))
-    return f"from {number(values[0])} to {number(values[1])}"
+def width(values: Sequence[float | str]) -> float:
+    """Width of an interval with the ends `values`; NaN for names of levels."""
+    return math.nan if isinstance(values[0], str) or isinstance(values[1], str) else values[1] - values[0]
 
 
-def _ends(values: list[float | str]) -> str:
+def _ends(values: list[float | str], study: Study, name: str) -> str:
     """Range of a parameter's values as text, for a cell: "1 to 2" for the two ends `values`, "1" if they are equal, and
     "a or b" for names of levels.
     """
-    if isinstance(values[0], str) or values[0] == values[1]:
-        return " or ".join(map(number, dict.fromkeys(values)))
-    return f"{number(values[0])} to {number(values[1])}"
+    texts = [parameter_text(study, name, value, width(values)) for value in dict.fromkeys(values)]
+    return (" or " if isinstance(values[0], str) else " to ").join(texts)
 
 
 def _as_toml(parameters: Mapping[str, float | str], study: Study) -> str:

@@ -269,11 +269,19 @@ def test_a_program_with_a_newer_link_takes_over_at_once(live):
     live.device_did("stopped", "ready", "lost", "ready")
 
 
+def test_a_program_that_has_not_joined_yet_is_waited_for_and_is_no_fault(live):
+    seen = live.until(lambda v: v["phase"] == "trouble", live.whole)
+    assert (seen["device"]["state"], seen["device"]["level"], seen["alert"]) == ("waiting", "rest", None)
+    assert seen["phase_words"] == "Waiting for the stimulus program: start it with its link"
+    live.by_hand()
+    live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+
+
 def test_nobody_presents_before_the_stop_was_seen(live):
     program = live.by_hand(force=True, ready=False, neutral_within_s=10.0)
     assert program.order["do"] == "stop"
     live.participant.post("/api/participant/begin", {})
-    assert live.whole()["device"]["state"] == "lost"
+    assert live.whole()["device"]["state"] == "waiting"
     with refused(409, "is stop; there is nothing to present"):
         program.report("presented", trial="tag:1.1")
     program.report("neutral")

@@ -1,4 +1,4 @@
-"""`hilbo try` in headless Chromium, by a scripted person: a whole session, at two sizes of the window."""
+"""`hilbo try` in headless Chromium, by a scripted person: a whole session, at three sizes of the window."""
 
 import json
 import subprocess
@@ -56,11 +56,19 @@ def places(page):
 
 
 def fits(page):
-    """Whether nothing is beyond the window's edges, or wider than its own box."""
+    """Whether nothing is beyond the window's edges."""
     return page.evaluate(
         "document.documentElement.scrollHeight <= innerHeight && document.documentElement.scrollWidth <= innerWidth"
         " && [...document.querySelectorAll('main:not([hidden]) *')].every((e) => e.getBoundingClientRect().bottom"
         " <= innerHeight)"
+    )
+
+
+def fits_across(page):
+    """Whether nothing that is visible is beyond the window's right edge, nor wider than its own box."""
+    return page.evaluate(
+        "document.documentElement.scrollWidth <= innerWidth && [...document.querySelectorAll('body *')].every((e) =>"
+        " e.getBoundingClientRect().right <= innerWidth + 1 && (!e.clientWidth || e.scrollWidth <= e.clientWidth + 1))"
     )
 
 
@@ -76,7 +84,7 @@ def answer(page, person, by_key):
         page.wait_for_timeout(20)
 
 
-@pytest.mark.parametrize(("width", "height"), [(1440, 900), (1024, 768)])
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (1024, 768), (390, 844)])
 def test_a_whole_session(served, tmp_path, width, height):
     with browser() as program:
         page = program.new_context(viewport={"width": width, "height": height}).new_page()
@@ -91,7 +99,7 @@ def test_a_whole_session(served, tmp_path, width, height):
         before = places(page)
         for trial in range(TRIALS):
             force, *depths = ready(page)
-            assert force == 0 and max(depths) < 0.5 and fits(page)
+            assert force == 0 and max(depths) < 0.5 and fits(page) and fits_across(page)
             if trial in (0, 9):
                 force, *pressed = press(page, 1.0)
                 assert force == pytest.approx(3.0, abs=1e-3) and min(pressed) > 0.3
@@ -104,7 +112,9 @@ def test_a_whole_session(served, tmp_path, width, height):
                 ready(page)
             answer(page, person, by_key=trial % 2 == 0)
         page.wait_for_selector("#results:visible", timeout=PATIENCE)
-        assert fits(page) and "of the ranges away from the hidden reference" in page.inner_text("#verdict")
+        phone = width < 700  # where the maps are below each other
+        assert fits_across(page) if phone else fits(page)
+        assert "of the ranges away from the hidden reference" in page.inner_text("#verdict")
         assert [len(row.split("\t")) for row in page.inner_text("#values").splitlines()] == [4, 4, 4]
         assert page.locator("#maps canvas").count() == 3 and mishaps == []
     check_log(tmp_path / "out", person)

@@ -52,9 +52,9 @@ def test_a_legend_names_every_answer_and_how_many_a_disc_holds():
         return [handle.get_label() for handle in answer_handles(STUDY, np.array(counts), **options)]
 
     assert labels([1, 1]) == ["bad", "fair", "good"]
-    assert labels([1, 2, 4])[3:] == ["shares of 2\nto 4 answers"]
-    assert labels([17, 17])[3:] == ["shares of 17\nanswers"]
-    assert labels([1, 3], discs=False)[3:] == ["mark of 3\nanswers"]
+    assert labels([1, 2, 4])[3:] == ["proportions of 2\nto 4 responses"]
+    assert labels([17, 17])[3:] == ["proportions of 17\nresponses"]
+    assert labels([1, 3], discs=False)[3:] == ["mark of 3\nresponses"]
 
 
 def test_answers_at_places_of_their_own_have_their_own_marks():

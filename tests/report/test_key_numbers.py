@@ -62,11 +62,11 @@ def test_key_results_agree_with_a_second_computation(analysed):
 def test_the_page_puts_what_the_study_names_beside(analysed):
     table = key_numbers_table(analysed, key_numbers(analysed, None, Reference(np.array([0.4, 0.5]), "the truth")))
     words = {row[0]: row[1:] for row in key_numbers_words(table)}
-    assert words["Population optimum: error to the truth (NRMSE)"] == ["7.91 %", "4 %"]
+    assert words["Population optimum: error to the truth (NRMSE) (%)"] == ["7.9", "4"]
     own = next(value for name, value in words.items() if name.startswith("Individual"))
     assert "(quartiles: " in own[0] and own[1] == "24 (13 to 41)"
-    assert words['Answers "close" of 4 per participant, mean'] == ["1.5 ± 1", ""]
-    assert words["Preferred"] == ["–", "72.75 %"]  # without a validation
+    assert words['Answers "close" of 4 per participant, mean'] == ["1.5 ± 1.0", ""]
+    assert words["Preferred (%)"] == ["–", "72.75"]  # without a validation
     alone = key_numbers_words(table.assign(compared_with=""))
     assert all(len(row) == 2 for row in alone)
 

@@ -34,11 +34,11 @@ def test_a_missing_number_is_an_error():
 
 
 def test_an_extent_has_both_ends_or_every_level():
-    extent = _environment().filters["extent"]
-    assert extent([0.25, 3.0]) == "from 0.25 to 3"
-    assert extent([4.0, 4.0]) == "= 4"
-    assert extent(["stone"]) == "= stone"
-    assert extent(["silk", "stone", "wood"]) == "= silk or stone or wood"
+    study, ends = plain_study(2), _environment().filters["ends"]  # p1 from 1 to 10
+    assert ends([1.25, 3.0], study, "p1") == "1.2 to 3.0"
+    assert ends([4.0, 4.0], study, "p1") == "4.00"
+    assert ends(["stone"], study, "p1") == "stone"
+    assert ends(["silk", "stone", "wood"], study, "p1") == "silk or stone or wood"
 
 
 def test_a_caption_is_text_in_the_description_of_its_figure():
@@ -157,11 +157,12 @@ def test_one_person_claims_no_sampling_error():
 def test_peaks_are_named_by_their_tops_and_a_single_one_is_not_named():
     """The mean of the draws on a peak may be a dark part of the map; its top is not."""
     peaks = _environment().get_template("parts.html").module.peaks
-    high = {"probability": 0.7, "top": {"hue": 254.3}, "centre": {"hue": 205.2}}
-    low = {"probability": 0.3, "top": {"hue": 150.0}, "centre": {"hue": 160.0}}
-    assert str(peaks([high])) == ""
-    page = " ".join(str(peaks([high, low])).split())
-    assert "hue = 254.3 (70 %); hue = 150 (30 %)." in page and "205.2" not in page
+    study = plain_study(2)
+    high = {"probability": 0.7, "top": {"p1": 7.543}, "centre": {"p1": 5.2}}
+    low = {"probability": 0.3, "top": {"p1": 2.0}, "centre": {"p1": 3.0}}
+    assert str(peaks(study, [high])) == ""
+    page = " ".join(str(peaks(study, [high, low])).split())
+    assert "p1 = 7.54 (70 %); p1 = 2.00 (30 %)." in page and "5.2" not in page
 
 
 def test_a_sentence_in_a_table_wraps_and_a_number_does_not():
@@ -193,12 +194,14 @@ def test_the_card_of_a_page_has_the_answer(region):
     ]
     content = {"optimum": {"parameters": best, "class_probabilities": {"bad": 0.2, "good": 0.8}}, "rule": "learnt-2"}
     content |= {"highest_answer": {"low": 0.6, "high": 0.9}, "key_numbers": numbers}
+    content["warnings"] = ["The optimum is at the lowest u (0 kbit/s): values beyond it were not tested.", "Remark."]
     content["optimum_region"] = region and {"probability": 0.95, "volume": 0.1, "located": True, "parameters": region}
     card = _environment().from_string('{% import "card.html" as answer %}{{ answer.card(study, content, 3, 60, {}) }}')
     text = unescape(card.render(study=dataclasses.replace(study, learnt=object()), content=content))
     assert tomllib.loads(re.search(r"<pre>(.*?)</pre>", text, re.S)[1])["optimum"] == best
     said = " ".join(text.split())
     assert "nan" not in said and "Individual error: 12.5 %" in said and "80 % (95 % interval 60 % to 90 %)" in said
-    assert ("from wood or tin" in said and "0.2 to 0.4" in said) == (region is not None)
+    assert ("from wood or tin" in said and "0.20 to 0.40" in said) == (region is not None)
     assert ("Located: the credible region covers 10 % of the feasible region" in said) == (region is not None)
+    assert "u (kbit/s)<sup>1</sup>" in said and "Optimum<sup>2</sup>" in said and "<li>Remark.</li>" in said
     assert ("region was not computed" in said) == (region is None)

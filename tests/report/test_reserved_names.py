@@ -20,7 +20,7 @@ from hilbo.report.participants import People
 from hilbo.report.results import moved, optima_table
 from hilbo.report.study.comparison import comparison_table
 from hilbo.report.study.dictionary import dictionary
-from hilbo.report.study.report import _alternatives
+from hilbo.report.study.page_tables import alternatives_rows
 from hilbo.report.study.result_tables import alternatives_table
 from hilbo.session.export.tables import sets_table, trials_table
 from hilbo.simulation.simulate import to_table, truth_table
@@ -145,4 +145,4 @@ def test_a_parameter_called_f_keeps_its_values():
     study = called("f")
     table = alternatives(study)
     assert table["f"].tolist() == [0.5] * 4 and table["mean"].iloc[0] == 0.75 and study.space.names == ("f", "v")
-    assert _alternatives(study, table)["head"] == ["", "f", "v", "latent score", "sd"]
+    assert alternatives_rows(study, table)["head"] == ["", "f", "v", "latent score", "sd"]

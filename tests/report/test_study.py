@@ -23,7 +23,7 @@ from hilbo.report.figures.people import people_figure
 from hilbo.report.figures.progress import individual_convergence
 from hilbo.report.study.comparison import comparison_section
 from hilbo.report.study.hypotheses import _convergence, _materials, _nearer_to_others
-from hilbo.report.study.report import _alternatives, _shown, _tolerances
+from hilbo.report.study.page_tables import alternatives_rows, measures_rows, tolerance_rows
 from hilbo.report.study.study_figures import comparison_figures
 from hilbo.report.validation import validate
 from hilbo.search.box import Parameter
@@ -134,12 +134,13 @@ def test_other_materials_are_the_others():
 
 
 def test_measures_have_the_digits_that_answers_give():
-    head, rows = _shown(pd.DataFrame({"lapse_low": [0.12345], "trials": [25], "drift_high": [np.inf]}), digits=2)
-    assert (head, rows) == (["lapse_low", "trials", "drift_high"], [["0.12", "25", "∞"]])
+    people = {"trials": [25], "lapse": [0.1234], "lapse_low": [0.0], "lapse_high": [0.456], "drift_high": [np.inf]}
+    head, rows = measures_rows(pd.DataFrame(people))
+    assert (head, rows) == (list(people), [["25", "0.12", "0.00", "0.46", "∞"]])
     row = dict(hyperparameters="fixed", parameter="u", draws_without=0.0, low_end="range", high_end="range")
     row |= dict(low=1.0, high=12.346, low_from=1.0, low_to=1.2346, high_from=1.1, high_to=12.346)
-    ((*_, low, ends, _),) = _tolerances(pd.DataFrame([row]))
-    assert (low, ends) == ("12.35 (range)", "1.1 to 12")
+    ((*_, low, ends, without),) = tolerance_rows(plain(), pd.DataFrame([row]))
+    assert (low, ends, without) == ("12 (range)", "1 to 12", "0")
 
 
 def test_what_is_not_known_of_somebody_is_a_line_without_a_mark():
@@ -176,8 +177,8 @@ def test_one_person_has_no_resamples():
     assert not can_resample(posteriors)
     row = dict(hyperparameters="fixed", parameter="v", draws_without=ends.lost, low_end="range", high_end="range")
     row |= dict(low=1.0, high=2.0, low_from=np.nan, low_to=np.nan, high_from=np.nan, high_to=np.nan)
-    ((*_, low, low_draws, _, high_draws, without),) = _tolerances(pd.DataFrame([row]))
-    assert (low, low_draws, high_draws, without) == ("1 (range)", "–", "–", "–")
+    ((*_, low, low_draws, _, high_draws, without),) = tolerance_rows(plain(), pd.DataFrame([row]))
+    assert (low, low_draws, high_draws, without) == ("1.00 (range)", "–", "–", "–")
 
 
 @pytest.mark.deep
@@ -362,7 +363,8 @@ def test_the_comparison_of_rules_is_shown():
         "recommendation": "Use hierarchical.",
     }
     shown = comparison_section(plain(), content)
-    assert shown["words"] == "Use hierarchical." and shown["head"][:3] == ["rule", "negative log density", "difference"]
+    assert shown["words"] == "Use hierarchical."
+    assert shown["head"][:3] == ["method", "negative log density", "difference"]
     assert [row[:3] for row in shown["rows"]] == [["hierarchical", "1.100", ""], ["bcm", "1.300", "+0.200 ± 0.050"]]
     assert shown["refused"] == ["pooled: too many"]
     figures = comparison_figures(content)
@@ -372,9 +374,9 @@ def test_the_comparison_of_rules_is_shown():
 def test_no_column_of_what_is_not_there():
     rows = {"optimum": ["population", "mid"], "u": [0.25, 1.0], "mean": [0.123, np.nan]}
     rows |= {"passivity_margin": [None, None]}
-    shown = _alternatives(plain(), pd.DataFrame(rows))
+    shown = alternatives_rows(plain(), pd.DataFrame(rows))
     assert shown["head"] == ["", "u", "latent score"]
-    assert shown["rows"] == [["population map (bcm)", "0.25", "0.12"], ["mid of the sets to compare", "1", ""]]
+    assert shown["rows"] == [["population map (bcm)", "0.250", "0.12"], ["mid of the sets to compare", "1.000", ""]]
 
 
 def test_every_estimate_of_the_optimum_has_words():
@@ -382,6 +384,6 @@ def test_every_estimate_of_the_optimum_has_words():
         "population",
         *(f"population, {name}" for name in ("ep", "laplace", *RULES, "optimised hyperparameters")),
     ]
-    rows = _alternatives(plain(), pd.DataFrame({"optimum": labels, "u": 0.5}))["rows"]
+    rows = alternatives_rows(plain(), pd.DataFrame({"optimum": labels, "u": 0.5}))["rows"]
     words = [row[0] for row in rows]
     assert len(set(words)) == len(words) and not any(label in words for label in labels[:-1])

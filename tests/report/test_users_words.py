@@ -55,7 +55,9 @@ def test_responses_and_what_is_judged_are_no_formula(which):
             PLAIN | {"study": {"name": "a", "responses": ["a", "b", "c"], "attribute": f"value of {WORDS}"}}
         )
         flat = lambda x: (np.zeros(len(x)), np.ones(len(x)))  # noqa: E731
-        assert f"value of {WORDS} f" in shown(maps_beside(two, {"one": flat}, np.array([[0.5, 0.5]])))
+        assert f"mean latent score f (no unit)\nvalue of {WORDS}" in shown(
+            maps_beside(two, {"one": flat}, np.array([[0.5, 0.5]]))
+        )
     elif which == "responses":
         figure = predictive_check(STUDY.responses, np.array([0.5, 0.5]), np.full((3, 2), 0.5))
         assert set(STUDY.responses) <= shown(figure)

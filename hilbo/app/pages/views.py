@@ -33,10 +33,11 @@ _PHASE_WORDS = {
     "answer": "Waiting for the answer",
     "idle": "Nothing to do",
 }
+_ROLES = {"Stimulus": "stimulus program", "Preparer": "page of the preparer"}
 _SCREEN_WORDS = {
     "ready": "Warm-up done: the participant may have another one, or begin",
     "rest": "Rest: go on when the participant is ready",
-    "done": "All trials are answered",
+    "done": "All trials are answered: note the participant's remarks, then end the server with Ctrl-C in its terminal",
     "ended": "Ended",
 }
 
@@ -147,7 +148,7 @@ def experimenter(hub: HubInterface) -> View:
         "trust": hub.trust,
         "table": table(state),
         "log": [line(state, event) for event in list(hub.recent)[:60]],
-        "alert": hub.alert or hub.fault or (runner.stage == "trouble" and runner.trouble) or hub.without_map or None,
+        "alert": hub.alert or hub.fault or _trouble(hub) or hub.without_map or None,
         "may": _may(hub),
         "means": {"void": meant(state.voidable), "undo": meant(state.last_answered), "skip": meant(state.skippable)},
         "map_version": map_version(state) + ("" if hub.draws else " later"),
@@ -176,8 +177,19 @@ def _phase_words(hub: HubInterface, trial: Trial | None) -> str:
     if runner.stage == "step" and trial is not None:
         return participant_view(hub.state)["trial"]["steps"][runner.step]["text"]
     if runner.stage == "trouble":
-        return "Stopped: " + runner.trouble
+        waits = f"Waiting for the {_ROLES[hub.rig.title]}: start it with its link" if _waiting(hub) else ""
+        return waits or "Stopped: " + runner.trouble
     return _PHASE_WORDS.get(runner.stage, runner.stage)
+
+
+def _waiting(hub: HubInterface) -> bool:
+    """Whether no program or person has joined yet, which is no fault."""
+    return hub.rig.snapshot.state == "WAITING"
+
+
+def _trouble(hub: HubInterface) -> str:
+    """Why nothing can be presented, if that is a fault; else empty."""
+    return hub.runner.trouble if hub.runner.stage == "trouble" and not _waiting(hub) else ""
 
 
 def _trial_rows(hub: HubInterface, trial: Trial | None) -> list[list[str]]:
@@ -264,8 +276,11 @@ def _device(hub: HubInterface) -> View:
     """State of the rig for the experimenter: title, state, colour (`level`: "bad", "good" or "rest"), words and
     rows."""
     seen = hub.rig.snapshot
-    level = "bad" if seen.lost or seen.state in ("HOLD", "ESTOP") else "good" if seen.state == "RUNNING" else "rest"
-    state, rows = "lost" if seen.lost else seen.state.lower(), [list(row) for row in seen.rows]
+    waits = _waiting(hub)
+    level = "bad" if seen.state in ("HOLD", "ESTOP") or (seen.lost and not waits) else "rest"
+    level = "good" if seen.state == "RUNNING" and not seen.lost else level
+    state = "lost" if seen.lost and not waits else seen.state.lower()
+    rows = [list(row) for row in seen.rows]
     rows = ([["Reason", seen.reason]] if seen.reason and not seen.lost else []) + rows
     words = seen.lost or hub.rig.words
     return {"title": hub.rig.title, "state": state, "level": level, "words": words, "rows": rows}

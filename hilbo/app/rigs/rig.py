@@ -16,10 +16,10 @@ __all__ = ["Loaded", "MissedError", "Notice", "Rig", "Showing", "Snapshot"]
 class Snapshot(NamedTuple):
     """The last known state of a rig.
 
-    `state`: RUNNING, STOPPED, HOLD, ESTOP or LOST. `contact`: something touches it. `lost`: why it is not available,
-    None while it is. `reason`: why it is in HOLD or ESTOP. `facts`: what the log gets of it. `rows`: what the
-    experimenter sees of it, names and values. `excused`: its state comes from a time without a server, so that it voids
-    no trial.
+    `state`: RUNNING, STOPPED, HOLD, ESTOP, LOST, or WAITING before the first program or person has joined. `contact`:
+    something touches it. `lost`: why it is not available, None while it is. `reason`: why it is in HOLD or ESTOP.
+    `facts`: what the log gets of it. `rows`: what the experimenter sees of it, names and values. `excused`: its state
+    comes from a time without a server, so that it voids no trial.
     """
 
     state: str

@@ -64,7 +64,7 @@ class StimulusRig:
         self.title = self.role.capitalize()
         self.notes: list[str] = []
         self.order = Order(1, "neutral")
-        self.snapshot = Snapshot("LOST", False, _NOBODY[self.role], excused=True)
+        self.snapshot = Snapshot("WAITING", False, _NOBODY[self.role], excused=True)
         self._hello: Hello | None = None
         self._run, self._key = "", ""  # of the program that presents; no run while there is none
         self._news, self._moved = asyncio.Event(), asyncio.Event()

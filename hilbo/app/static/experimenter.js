@@ -130,8 +130,8 @@ function showMap() {
   put("scale-low", number(low, 2)); put("scale-high", number(high, 2));
   put("map-title", high > low ? "Posterior mean, slices through the optimum" : "Posterior mean: the same everywhere so far");
   put("legend", [
-    high > low ? "Cross: the optimum." : "", "Circles: rated stimuli, darker for higher responses, fainter away from the slice.",
-    marks.some((t) => t.now) ? "Red ring: the stimulus presented now." : "",
+    high > low ? "Star: the optimum." : "", "Circles: rated stimuli, darker for higher responses, fainter away from the slice.",
+    marks.some((t) => t.now) ? "Ring: the stimulus presented now." : "",
     infeasible(slices) ? "Hatched: infeasible." : "",
   ].filter(Boolean).join(" "));
   drawMap(at("map"), slices, ranges);

@@ -1,7 +1,9 @@
 // Slices of the posterior mean, with axes and a colour scale: one canvas for each pair of parameters.
 "use strict";
 
-const STOPS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
+// Colour map, cividis, and the colour of the optimum: those of the figures of reports.
+const STOPS = [[0, 34, 78], [26, 56, 111], [67, 78, 108], [97, 101, 111], [125, 124, 120], [155, 148, 118], [188, 174, 108], [222, 201, 88], [254, 232, 56]];
+const OPTIMUM = "#d55e00", INK = "#111";
 
 function colour(share) {
   const s = Math.min(1, Math.max(0, share)) * (STOPS.length - 1), i = Math.min(STOPS.length - 2, Math.floor(s)), f = s - i;
@@ -34,21 +36,28 @@ function drawMean(c, slice, range, side) {
   c.stroke();
 }
 
-function cross(c, x, y) {
-  c.beginPath(); c.moveTo(x - 6, y); c.lineTo(x + 6, y); c.moveTo(x, y - 6); c.lineTo(x, y + 6); c.stroke();
+// The optimum: a star with a white outline.
+function star(c, x, y) {
+  c.beginPath();
+  for (let k = 0; k < 10; k++) {
+    const r = k % 2 ? 4.2 : 10.5, a = Math.PI * k / 5;
+    c.lineTo(x + r * Math.sin(a), y - r * Math.cos(a));
+  }
+  c.closePath(); c.lineJoin = "round"; c.lineWidth = 3; c.strokeStyle = "#fff"; c.stroke(); c.fillStyle = OPTIMUM; c.fill();
 }
 
-function ring(c, x, y) { c.beginPath(); c.arc(x, y, 9, 0, 7); c.stroke(); }
+function ring(c, x, y, radius) { c.beginPath(); c.arc(x, y, radius, 0, 7); c.stroke(); }
 
-function twice(c, inner, widths, draw) {                          // a light outline, so that it is seen on any colour
-  for (const [style, width] of [["#fff", widths[0]], [inner, widths[1]]]) { c.strokeStyle = style; c.lineWidth = width; draw(); }
+function twice(c, widths, draw) {                                 // a light outline, so that it is seen on any colour
+  for (const [style, width] of [["#fff", widths[0]], [INK, widths[1]]]) { c.strokeStyle = style; c.lineWidth = width; draw(); }
 }
 
 function dot(c, x, y, t) {
-  c.beginPath(); c.arc(x, y, t.now ? 7 : 4.5, 0, 7);
-  c.globalAlpha = t.now ? 1 : 1 - .75 * Math.min(1, t.away);      // fainter the farther from the slice
-  if (!t.now) { const g = Math.round(255 * (1 - t.level)); c.fillStyle = `rgb(${g},${g},${g})`; c.fill(); }
-  c.lineWidth = t.now ? 2.5 : 1.2; c.strokeStyle = t.now ? "#d1495b" : "#fff"; c.stroke();
+  if (t.now) { twice(c, [5, 2.5], () => ring(c, x, y, 7)); return; }
+  c.beginPath(); c.arc(x, y, 4.5, 0, 7);
+  c.globalAlpha = 1 - .75 * Math.min(1, t.away);                  // fainter the farther from the slice
+  const g = Math.round(255 * (1 - t.level)); c.fillStyle = `rgb(${g},${g},${g})`; c.fill();
+  c.lineWidth = 1.2; c.strokeStyle = t.level > .5 ? "#fff" : INK; c.stroke();
   c.globalAlpha = 1;
 }
 
@@ -65,8 +74,8 @@ function drawSlice(canvas, slice, across, up, range) {
   const shown = (p, u) => count(p) ? (Math.round(u * (count(p) - 1)) + .5) / count(p) : u;
   const place = (u, v) => [x + shown(across, u) * side, y + (1 - shown(up, v)) * side];
   for (const t of slice.trials) dot(c, ...place(t.x, t.y), t);
-  if (range[1] > range[0]) twice(c, "#111", [4, 1.8], () => cross(c, ...place(...slice.best)));
-  if (across.hidden_unit !== undefined) twice(c, "#d1495b", [6, 3], () => ring(c, ...place(across.hidden_unit, up.hidden_unit)));
+  if (range[1] > range[0]) star(c, ...place(...slice.best));
+  if (across.hidden_unit !== undefined) twice(c, [6, 3], () => ring(c, ...place(across.hidden_unit, up.hidden_unit), 13));
   c.fillStyle = "#1d2733"; c.font = text + font; c.textAlign = "center";
   if (slice.held) c.fillText(`at ${slice.held}`, x + side / 2, y - 6);
   const ticks = (p) => count(p) ? p.levels.map((_, i) => (i + .5) / count(p)) : [0, 0.5, 1];

@@ -214,9 +214,10 @@ function draw(canvas) {
   const ratio = devicePixelRatio, w = canvas.clientWidth, h = canvas.clientHeight, c = canvas.getContext("2d");
   canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio);   // which also clears it
   c.scale(ratio, ratio);
-  const size = { w: Math.min(w * 0.4, 1.75 * h), h: h * 0.64, top: h * 0.27, scale: h * 0.64 / HEIGHT };
-  drawBlock(c, w * 0.27, size, state.depths[0], "Reference", "#1f5673", "#cfe0e8");
-  drawBlock(c, w * 0.73, size, state.depths[1], "Test", "#8a4b00", "#f6ddb8");
+  const narrow = w < 600, wide = narrow ? 0.34 : 0.4, places = narrow ? [0.31, 0.79] : [0.27, 0.73];   // on a phone the rulers need room
+  const size = { w: Math.min(w * wide, 1.75 * h), h: h * 0.64, top: h * 0.27, scale: h * 0.64 / HEIGHT };
+  drawBlock(c, w * places[0], size, state.depths[0], "Reference", "#1f5673", "#cfe0e8");
+  drawBlock(c, w * places[1], size, state.depths[1], "Test", "#8a4b00", "#f6ddb8");
   c.fillStyle = "#1d2733"; c.textAlign = "center";
   c.font = "600 20px system-ui, sans-serif"; c.fillText(`${state.force.toFixed(1)} N`, w / 2, size.top - 62);
   c.font = "14px system-ui, sans-serif"; c.fillStyle = "#4a5663"; c.fillText("on both", w / 2, size.top - 40);
@@ -254,8 +255,9 @@ function drawRuler(c, left, size, ink) {
   c.strokeStyle = c.fillStyle = ink; c.lineWidth = 1; c.textAlign = "right"; c.font = "13px system-ui, sans-serif";
   for (let mm = 0, y = size.top; mm <= HEIGHT; mm += 2, y += 2 * size.scale) {
     c.beginPath(); c.moveTo(left - 4, y); c.lineTo(left - 12, y); c.stroke();
-    c.fillText(mm === 0 ? "0 mm" : String(mm), left - 16, y + 4.5);
+    c.fillText(String(mm), left - 16, y + 4.5);
   }
+  c.fillText("mm", left - 4, size.top - 10);
 }
 
 async function results() {               // the end: one's own map

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 
-from hilbo.report.figures.style import ORANGE, plain
+from hilbo.report.figures.style import plain
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 
@@ -19,6 +18,7 @@ __all__ = ["answer_handles", "mark_along", "mark_trials"]
 
 _NEAR = 0.08  # trials within this distance of a slice, in the unit cube, are drawn on it
 _SHAPES = ("v", "s", "^", "D", "P", "X", "p", "h", "<", ">")
+_DARK = 0.5  # lightness below which a mark has a white edge, so that it is seen on any colour of a map
 _FEW, _MANY = 24.0, 80.0  # areas of the discs of two answers and of the most, points²
 _CORNERS = 60  # of a whole disc
 
@@ -82,7 +82,7 @@ def answer_handles(study: Study, counts: Int[np.ndarray, " p"], *, discs: bool =
         fills = {"markerfacecolor": _fill(study, len(study.responses) - 1), "markerfacecoloralt": _fill(study, 0)}
         shares = {"marker": "o", "fillstyle": "left", **fills}
         larger = {"marker": "o", "markerfacecolor": "none"}
-        words = ("shares of " if discs else "mark of ") + f"{number}answers"
+        words = ("proportions of " if discs else "mark of ") + f"{number}responses"
         handles.append(_handle(words, **(shares if discs else larger) | {"markersize": 7}))
     return handles
 
@@ -94,18 +94,27 @@ def _answers(cohort: Cohort) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, 
 
 
 def _look(study: Study, category: int) -> dict[str, Any]:
-    """Keyword arguments of `scatter` for a category: a distinct shape, the darker the higher the category; the
-    goal is a circle.
+    """Keyword arguments of `scatter` for a category: a distinct shape, and the darker the higher the category, so that
+    ordered responses are told apart in print without colours too; the goal is a circle.
     """
     top = category == study.goal.category
-    look: dict[str, Any] = {"marker": "o" if top else _SHAPES[category % len(_SHAPES)], "s": 15 if top else 9}
-    return look | {"facecolor": _fill(study, category), "edgecolor": "black", "linewidth": 0.5}
+    look: dict[str, Any] = {"marker": "o" if top else _SHAPES[category % len(_SHAPES)], "s": 20 if top else 14}
+    return look | {"facecolor": _fill(study, category), "edgecolor": _edge(study, category), "linewidth": 0.5}
+
+
+def _lightness(study: Study, category: int) -> float:
+    """Lightness of a category in equal steps: 1 (white) for the lowest, 0 (black) for the highest."""
+    return 1 - category / (len(study.responses) - 1)
 
 
 def _fill(study: Study, category: int) -> tuple[float, ...]:
-    """Colour (red, green, blue) of a category: from white for the lowest to orange for the highest."""
-    share = category / (len(study.responses) - 1)
-    return tuple(1 - share * (1 - part) for part in to_rgb(ORANGE))
+    """Grey (red, green, blue) of a category."""
+    return (_lightness(study, category),) * 3
+
+
+def _edge(study: Study, category: int) -> str:
+    """Colour of the outline of a category's mark: black around a light one, white around a dark one."""
+    return "white" if _lightness(study, category) < _DARK else "black"
 
 
 def _area(count: Any, most: int) -> Any:
@@ -125,10 +134,8 @@ def _disc(axes, study: Study, point: Float[np.ndarray, " 2"], tally: Int[np.ndar
             corners = np.concatenate([[[0.0, 0.0]], corners])
         # Matplotlib scales a marker until its farthest corner is at the edge.
         size = area * np.abs(corners).max() ** 2
-        fill = _fill(study, category)
-        axes.scatter(
-            *point, marker=corners, s=size, facecolor=fill, edgecolor="black", linewidth=0.4, clip_on=False, zorder=3
-        )
+        look = {"facecolor": _fill(study, category), "edgecolor": _edge(study, category), "linewidth": 0.4}
+        axes.scatter(*point, marker=corners, s=size, clip_on=False, zorder=3, **look)
 
 
 def _handle(label: str, **look: Any) -> Line2D:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import BLUE, ORANGE, RED, label_axes, new_figure, score_label, styled
+from hilbo.report.figures.style import BLUE, ORANGE, label_axes, new_figure, score_label, star_at, styled
 from hilbo.study.analysis.effects import Effect
 from hilbo.study.config import Study
 
@@ -36,8 +36,8 @@ def effects_figure(study: Study, effects: Sequence[Effect], optimum: Float[np.nd
 
 
 def _draw(axes, effect: Effect, steps: bool, best: float) -> None:
-    """Draw one panel on `axes`: lines for a continuous parameter, points with bars for a discrete one (`steps`); and a
-    vertical line at the optimum's value `best`.
+    """Draw one panel on `axes`: lines for a continuous parameter, points with bars for a discrete one (`steps`); and
+    the star at the optimum's value `best`.
     """
     slice_words, average_words = "through the optimum, ± sd", "on average (main effect)"
     if steps:
@@ -49,4 +49,4 @@ def _draw(axes, effect: Effect, steps: bool, best: float) -> None:
         axes.fill_between(effect.values, low, high, color=BLUE, alpha=0.25, linewidth=0)
         axes.plot(effect.values, effect.mean, color=BLUE, label=slice_words)
         axes.plot(effect.values, effect.average, color=ORANGE, linestyle="--", label=average_words)
-    axes.axvline(best, color=RED, linewidth=1, linestyle=":", label="optimum")
+    star_at(axes, best, float(np.interp(best, effect.values, effect.mean)), "optimum")

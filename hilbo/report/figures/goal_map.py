@@ -10,7 +10,18 @@ from scipy.spatial import cKDTree
 
 from hilbo.kernels import Stationary, embedded
 from hilbo.report.figures.maps import along, label_curve, plane
-from hilbo.report.figures.style import BLUE, RED, few_ticks, label_axes, new_figure, plain, star, styled
+from hilbo.report.figures.style import (
+    BLUE,
+    COLOURS,
+    RED,
+    few_ticks,
+    label_axes,
+    new_figure,
+    plain,
+    star,
+    star_at,
+    styled,
+)
 from hilbo.study.analysis.region import Region
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate
@@ -35,15 +46,17 @@ def goal_map(study: Study, aggregate: Aggregate, region: Region | None) -> Figur
         return np.asarray(aggregate.class_probabilities(study.gp.likelihood, points))[:, study.goal.category]
 
     figure, axes = new_figure(_WIDTH, _HEIGHT)
-    best, label = np.asarray(aggregate.optimum.x), f'P("{plain(study.goal_label)}")'
+    best, label = np.asarray(aggregate.optimum.x), f'probability of "{plain(study.goal_label)}"'
     if len(study.space.free) == 1:
         _curve(axes, study, chances, region, label)
+        index = study.space.free[0]
+        star_at(axes, np.asarray(study.space.to_physical(best))[index], chances(best[None, :])[0])
         return figure
     pair = study.space.free[0], study.space.free[1]
     grid = plane(study, best, pair)
     label_axes(axes, study, *pair)
     image = grid.image(chances(grid.points))
-    scale = {"vmin": 0.0, "vmax": _scale_end(image), "cmap": "cividis", "shading": "nearest", "rasterized": True}
+    scale = {"vmin": 0.0, "vmax": _scale_end(image), "cmap": COLOURS, "shading": "nearest", "rasterized": True}
     bar = figure.colorbar(axes.pcolormesh(*grid.sides, image, **scale), ax=axes, label=label)
     few_ticks(bar.ax.yaxis)
     if region is not None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
@@ -20,6 +21,7 @@ from hilbo.numerics.host import to_device
 from hilbo.report.figures.answers import answer_handles, mark_along, mark_trials
 from hilbo.report.figures.style import (
     BLUE,
+    COLOURS,
     GREEN,
     GREY,
     ONE_COLUMN,
@@ -34,6 +36,7 @@ from hilbo.report.figures.style import (
     plain,
     score_label,
     star,
+    star_at,
     styled,
     title,
 )
@@ -154,19 +157,22 @@ def moved_optima(names: Sequence[str], moves: Float[ArrayLike, " M"], population
 @styled
 def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[str, Float[np.ndarray, " d"]]) -> Figure:
     """Individual optima (M, d), pair by pair of the first three parameters, with named points `marks`, such as the
-    population optimum; all in the unit cube.
+    population optimum, the star, which is the first; all in the unit cube.
     """
     d = study.space.dim
     pairs = [(0, 1), (0, 2), (1, 2)] if d > 2 else [(0, d - 1)]
     physical = np.asarray(study.space.to_physical(optima))
-    styles = (("*", RED, 140), ("X", ORANGE, 60), ("P", "black", 60), ("D", GREEN, 40))
+    styles = (("X", ORANGE, 60), ("P", "black", 60), ("D", GREEN, 40))
+    (first, best), *others = marks.items()
     figure, panels = new_figure(TWO_COLUMNS if len(pairs) > 1 else ONE_COLUMN, 2.7, 1, len(pairs), squeeze=False)
     for axes, (i, j) in zip(panels[0], pairs, strict=True):
         axes.scatter(physical[:, i], physical[:, j], s=20, color=BLUE, alpha=0.7, label="individuals", clip_on=False)
-        for (name, x), (marker, colour, size) in zip(marks.items(), styles, strict=False):
+        point = np.asarray(study.space.to_physical(best))
+        star_at(axes, point[i], point[j], first)
+        for (name, x), (marker, colour, size) in zip(others, styles, strict=False):
             point = np.asarray(study.space.to_physical(x))
             look = {"marker": marker, "s": size, "color": colour, "edgecolor": "white", "linewidth": 0.6}
-            axes.scatter(point[i], point[j], label=name, zorder=3, clip_on=False, **look)
+            axes.scatter(point[i], point[j], label=name, zorder=6, clip_on=False, **look)
         label_axes(axes, study, i, j)
     legend(figure, panels[0, 0].get_legend_handles_labels()[0])
     return figure
@@ -204,7 +210,7 @@ def map_panels(study: Study, grids):
     low, high = np.nanmin(heights), np.nanmax(heights)
     size = (ONE_COLUMN, 2.9) if len(grids) == 1 else (TWO_COLUMNS, 2.6)
     figure, ((*panels,),) = new_figure(*size, 1, len(grids), sharey=True, squeeze=False)
-    scale = ScalarMappable(Normalize(low, high), "cividis")
+    scale = ScalarMappable(Normalize(low, high), COLOURS)
     bar = figure.colorbar(scale, ax=panels, label=score_label(study), fraction=0.05, pad=0.02)
     few_ticks(bar.ax.yaxis, 5)
     for axes in panels:
@@ -214,7 +220,7 @@ def map_panels(study: Study, grids):
 
     def draw(axes, values):
         mean, sd, sides = values
-        axes.pcolormesh(*sides, mean, cmap="cividis", norm=scale.norm, shading="nearest", rasterized=True)
+        axes.pcolormesh(*sides, mean, cmap=COLOURS, norm=scale.norm, shading="nearest", rasterized=True)
         # Nothing may be rendered, or nothing is between the steps.
         if np.isnan(mean).all() or min(mean.shape) < 2 or not _has_lines(study):
             return
@@ -332,12 +338,13 @@ def draw_curve(axes, study: Study, curve: Sequence[np.ndarray], sd_label: str = 
 
 @styled
 def _map_curve(study, surface, optimum, cohort):
-    """Figure of `map_slices` for one parameter: the map's curve, the responses, and a line at the optimum."""
+    """Figure of `map_slices` for one parameter: the map's curve, the responses, and a star at the optimum."""
     figure, axes = new_figure(ONE_COLUMN, 2.5)
-    draw_curve(axes, study, curve(study, surface), "± standard deviation", "population map")
+    physical, mean, sd = curve(study, surface)
+    draw_curve(axes, study, (physical, mean, sd), "± standard deviation", "population map")
     counts = mark_along(axes, study, cohort)
     best = np.asarray(study.space.to_physical(np.asarray(optimum)))[study.space.free[0]]
-    axes.axvline(float(best), color=RED, linewidth=1, label="optimum")
+    star_at(axes, float(best), float(np.interp(best, physical, mean)), "optimum")
     legend(figure, [*axes.get_legend_handles_labels()[0], *answer_handles(study, counts, discs=False)])
     return figure
 
@@ -347,11 +354,12 @@ def _curves_beside(study, maps, optima):
     """Figure of `maps_beside` for one parameter: at most four maps' means on one panel, each with its optimum."""
     figure, axes = new_figure(ONE_COLUMN, 2.5)
     label_curve(axes, study)
-    for (name, surface), x, colour in zip(maps.items(), optima, (ORANGE, GREEN, BLUE, RED), strict=False):
+    shades = mpl.colormaps[COLOURS](np.linspace(0.85, 0.0, len(maps)))  # the more trials, the darker
+    for (name, surface), x, colour, dashes in zip(maps.items(), optima, shades, ("-", "--", "-.", ":"), strict=False):
         physical, mean, _ = curve(study, surface)
-        axes.plot(physical, mean, color=colour, label=name)
+        axes.plot(physical, mean, color=colour, linestyle=dashes, label=name)
         best = float(np.asarray(study.space.to_physical(np.asarray(x)))[study.space.free[0]])
-        axes.plot(best, np.interp(best, physical, mean), "*", color=colour, markersize=11, markeredgecolor="white")
+        star_at(axes, best, float(np.interp(best, physical, mean)))
     axes.autoscale(axis="y")
     axes.legend(frameon=False)
     return figure

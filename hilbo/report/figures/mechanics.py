@@ -14,7 +14,7 @@ from hilbo import passivity
 from hilbo.identification.characterise import Characterisation
 from hilbo.identification.fitting import Fit, Test
 from hilbo.identification.memory_selection import LIMIT, Row
-from hilbo.report.figures.style import BLUE, GREEN, GREY, ORANGE, RED, TWO_COLUMNS, new_figure, plain, styled
+from hilbo.report.figures.style import BLUE, COLOURS, GREEN, GREY, ORANGE, RED, TWO_COLUMNS, new_figure, plain, styled
 from hilbo.viscoelastic import FOSLS
 
 __all__ = ["bode_figure", "curves_figure", "memory_figure", "passive_set_figure", "passivity_figure", "predicted"]
@@ -138,7 +138,7 @@ def passivity_figure(model: FOSLS, b: float, delay: float = 0.0) -> Figure:
     frequency, curve = _needed(model, delay)
     worst = int(np.argmax(curve.real))
     margin, most = b - curve.real[worst], max(b, curve.real[worst])
-    colour, word = (GREEN, "margin") if margin >= 0 else (RED, "lacking")
+    colour, word = (GREEN, "margin") if margin >= 0 else (ORANGE, "lacking")
     lowest = min(-2 * most, curve.real[worst] - most)
     near = curve.real > lowest  # far to the left, in slow motion, nothing is decided
     frequency, near_curve = frequency[near], curve[near]
@@ -176,7 +176,7 @@ def passive_set_figure(model: FOSLS, b: float, K_eff: float, delay: float = 0.0)
     figure, (left, right) = new_figure(TWO_COLUMNS, 3.0, 1, 2)
     shown = np.clip(limit, 1, 32)
     picture = left.pcolormesh(
-        B1, alpha, np.where(limit < 1, np.nan, shown), cmap="cividis", vmin=1, vmax=32, rasterized=True
+        B1, alpha, np.where(limit < 1, np.nan, shown), cmap=COLOURS, vmin=1, vmax=32, rasterized=True
     )
     figure.colorbar(picture, ax=left, label="largest passive $K_1$ (N/mm; 32: the box)")
     left.plot(this_set[0], this_set[1], "*", color=RED, markersize=12, markeredgecolor="white")

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Posterior
 from hilbo.report.figures.maps import curve, draw_curve, plane
-from hilbo.report.figures.style import label_axes, level_words, score_label, star, styled
+from hilbo.report.figures.style import COLOURS, label_axes, level_words, score_label, star, styled
 from hilbo.search.candidates import search_points
 from hilbo.study.config import Study
 from hilbo.study.estimate.aggregate import Aggregate
@@ -56,8 +56,8 @@ def plot_map(
         )
     grid = plane(study, best, (i, j), _CELLS)
     mean = grid.image(_mean_and_variance(model, grid.points)[0])
-    drawn = axes.pcolormesh(*grid.sides, mean, cmap="cividis", shading="nearest", rasterized=True)
-    axes.figure.colorbar(drawn, ax=axes, label=f"{score_label(study)} (mean)")
+    drawn = axes.pcolormesh(*grid.sides, mean, cmap=COLOURS, shading="nearest", rasterized=True)
+    axes.figure.colorbar(drawn, ax=axes, label=score_label(study))
     label_axes(axes, study, i, j)
     star(axes, study, best, (i, j))
     held = [level_words(study, k, float(best[k])) for k in range(len(names)) if k not in (i, j, *dependent)]

@@ -7,7 +7,7 @@ import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import BLUE, GREY, ONE_COLUMN, RED, TWO_COLUMNS, legend, new_figure, plain, styled
+from hilbo.report.figures.style import BLUE, GREY, ONE_COLUMN, ORANGE, TWO_COLUMNS, legend, new_figure, plain, styled
 
 __all__ = ["people_figure", "predictive_check"]
 
@@ -15,18 +15,18 @@ __all__ = ["people_figure", "predictive_check"]
 @styled
 def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
     """Consistency, lapse rate and drift of every participant: a line for the 95 % interval, a mark for the estimate if
-    there is one; red crosses: excluded participants.
+    there is one; orange crosses: excluded participants.
 
     `people`: of `measure_people`; `left_out`: excluded participant -> reason.
     """
     rows = np.arange(len(people))[::-1]
     out = people["participant"].isin(list(left_out)).to_numpy()
     figure, panels = new_figure(TWO_COLUMNS, 1.2 + 0.14 * max(len(people), 4), 1, 3, sharey=True)
-    words = ("agreement of repeats", "lapse rate", "drift (prior standard deviations)")
+    words = ("test–retest agreement", "lapse rate", "drift (prior SD)")
     for axes, measure, label in zip(panels, ("consistency", "lapse", "drift"), words, strict=True):
         value, low, high = (people[f"{measure}{end}"].to_numpy(float) for end in ("", "_low", "_high"))
         limits = (-3.5, 3.5) if measure == "drift" else (-0.03, 1.03)
-        for part, color, mark in ((~out, BLUE, {"s": 16}), (out, RED, {"s": 26, "marker": "x"})):
+        for part, color, mark in ((~out, BLUE, {"s": 16}), (out, ORANGE, {"s": 26, "marker": "x"})):
             ends = np.maximum(low[part], limits[0]), np.minimum(high[part], limits[1])
             axes.hlines(rows[part], *ends, color=color, linewidth=1)
             known = part & np.isfinite(value)
@@ -48,11 +48,11 @@ def predictive_check(
     positions = np.arange(len(responses))
     low, middle, high = 100 * np.percentile(predicted, [2.5, 50, 97.5], axis=0)
     figure, axes = new_figure(ONE_COLUMN, 2.5)
-    look = {"width": 0.6, "color": "#c9d9e8", "edgecolor": "black", "linewidth": 0.6}
-    axes.bar(positions, 100 * observed, label="answers given", **look)
-    axes.vlines(positions, low, high, color=RED, linewidth=2)
-    axes.scatter(positions, middle, s=26, color=RED, zorder=3, label="would be given again")
+    look = {"width": 0.6, "color": "#dddddd", "edgecolor": "black", "linewidth": 0.6}
+    axes.bar(positions, 100 * observed, label="observed", **look)
+    axes.vlines(positions, low, high, color=BLUE, linewidth=2)
+    axes.scatter(positions, middle, s=26, color=BLUE, zorder=3, label="replicated")
     axes.set_xticks(positions, [*map(plain, responses)])
-    axes.set(ylabel="share of the answers (%)", ylim=(0, None))
+    axes.set(ylabel="proportion of responses (%)", ylim=(0, None))
     legend(figure, axes.get_legend_handles_labels()[0])
     return figure

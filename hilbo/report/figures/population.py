@@ -11,6 +11,7 @@ from hilbo.numerics.host import to_device
 from hilbo.report.figures.maps import curve, plane
 from hilbo.report.figures.style import (
     BLUE,
+    COLOURS,
     GREY,
     ONE_COLUMN,
     ORANGE,
@@ -46,8 +47,8 @@ def rules_figure(content: dict[str, Any]) -> Figure:
     left.axvline(0, color=ORANGE, linewidth=1)
     right.axvline(95, color=ORANGE, linewidth=1)
     left.set_yticks(rows, order)
-    left.set_xlabel("worse than the best rule by (nats an answer)")
-    right.set_xlabel("answers in the central 95 % (%)")
+    left.set_xlabel("loss above the best method (nats per response)")
+    right.set_xlabel("responses in the central 95 % interval (%)")
     return figure
 
 
@@ -63,7 +64,7 @@ def reliability_figure(content: dict[str, Any]) -> Figure:
         bins = content["rules"].get(rule, {}).get("reliability", [])
         points = [[b[key] for b in bins] for key in ("predicted", "observed")]
         axes.plot(*points, color=colour, marker=marker, markersize=4, linewidth=1, label=rule)
-    axes.set(xlabel="predicted probability of a category", ylabel="how often it was chosen")
+    axes.set(xlabel="predicted probability of a category", ylabel="observed frequency")
     axes.set(xlim=(0, 1), ylim=(0, 1))
     axes.legend(frameon=False)
     return figure
@@ -87,14 +88,14 @@ def coverage_figure(
         axes.plot(along, ratio, color=BLUE)
         axes.bar(along[unknown], 1.0, np.gradient(along)[unknown], **hatch)
         label_axes(axes, study, *2 * study.space.free[:1])
-        axes.set(ylabel="sd of the map, over that without answers", yscale="linear", ylim=(0, 1.05))
+        axes.set(ylabel="posterior SD / prior SD", yscale="linear", ylim=(0, 1.05))
     else:
         across, up = study.space.free[:2]
         grid = plane(study, point, (across, up), cells=_CELLS)
         ratio = grid.image(np.sqrt(np.asarray(predict(to_device(grid.points))[1]) / prior))
-        shown = axes.pcolormesh(*grid.sides, ratio, cmap="cividis", vmin=0, vmax=1, shading="nearest", rasterized=True)
+        shown = axes.pcolormesh(*grid.sides, ratio, cmap=COLOURS, vmin=0, vmax=1, shading="nearest", rasterized=True)
         unknown = np.ma.masked_where(~(ratio > limit), ratio)
         axes.pcolor(*grid.sides, unknown, shading="nearest", rasterized=True, **hatch)
-        figure.colorbar(shown, ax=axes, label="sd of the map, over that without answers")
+        figure.colorbar(shown, ax=axes, label="posterior SD / prior SD")
         label_axes(axes, study, across, up)
     return figure

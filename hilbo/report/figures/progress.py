@@ -55,7 +55,7 @@ def _top_answers(axes, study: Study, cohort: Cohort, trials: np.ndarray, xlabel:
     """
     top = np.asarray((cohort.trials.q == study.goal.category) & cohort.trials.mask)
     band(axes, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
-    axes.set(xlabel=xlabel, ylabel=f'answers "{plain(study.goal_label)}" so far', ylim=(0, None))
+    axes.set(xlabel=xlabel, ylabel=f'cumulative "{plain(study.goal_label)}" responses', ylim=(0, None))
     axes.legend(frameon=False, loc="upper left")
     few_ticks(axes.yaxis, 5, integer=True)
     few_ticks(axes.xaxis, 6, integer=True)
@@ -76,7 +76,7 @@ def population_convergence(progress: Progress, references: Mapping[str, Float[np
         axes.plot(progress.counts, miss, label=f"to {name}", **look)
     if progress.splits:
         halves = 100 * np.median(progress.halves, axis=1)
-        axes.plot(progress.counts, halves, color=GREY, linestyle="--", label="between halves")
+        axes.plot(progress.counts, halves, color=GREY, linestyle="--", label="between split halves")
     axes.set(xlabel="trials of each participant", ylabel="NRMSE of the population optimum (%)", ylim=(0, None))
     few_ticks(axes.xaxis, 6, integer=True)
     legend(figure, axes.get_legend_handles_labels()[0])
@@ -105,7 +105,7 @@ def progress_figure(study: Study, population: CohortResults, truth: Float[np.nda
         left.plot(trials, 100 * to_end, color=GREY, linestyle="--", label="population map, to its final optimum")
     elif progress.splits:
         halves = 100 * np.median(progress.halves, axis=1)
-        left.plot(trials, halves, color=GREY, linestyle="--", label="between halves of the people")
+        left.plot(trials, halves, color=GREY, linestyle="--", label="between split halves")
     left.set(xlabel="trials of each participant", ylabel=f"NRMSE to {goal} (%)")
     left.set_ylim(0, left.get_ylim()[1] * 1.25)  # room for the legend
     left.legend(frameon=False, loc="upper right")

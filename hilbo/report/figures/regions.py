@@ -12,7 +12,18 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from hilbo.report.figures.maps import along, plane
-from hilbo.report.figures.style import RED, TWO_COLUMNS, label_axes, legend, new_figure, plain, star, styled, title
+from hilbo.report.figures.style import (
+    COLOURS,
+    RED,
+    TWO_COLUMNS,
+    label_axes,
+    legend,
+    new_figure,
+    plain,
+    star,
+    styled,
+    title,
+)
 from hilbo.study.analysis.analysis import Reading
 from hilbo.study.analysis.tolerance import slice_through
 
@@ -30,7 +41,7 @@ def class_regions(readings: Mapping[str, Reading]) -> Figure:
     study = next(iter(readings.values())).study
     free, labels = study.space.free, [*map(plain, study.responses)]
     pairs = [(free[0], j) for j in (free[1:3] or free)]
-    shades = ListedColormap(mpl.colormaps["cividis"](np.linspace(0.12, 1.0, len(labels))))
+    shades = ListedColormap(mpl.colormaps[COLOURS](np.linspace(0.12, 1.0, len(labels))))
     rows, across = (len(readings), len(pairs)) if len(pairs) > 1 else (1, len(readings))
     figure, grid = new_figure(TWO_COLUMNS, 2.4 * rows + 0.4, rows, across, squeeze=False)
     for (name, reading), row in zip(readings.items(), grid.reshape(len(readings), len(pairs)), strict=True):
@@ -94,7 +105,7 @@ def _class_curves(axes, reading, shades):
     interval, _ = reading.tolerances.get(study.space.parameters[index].name, (None, None))
     if interval is not None:
         axes.hlines(0.5, interval.low, interval.high, color=RED, linewidth=2)
-    axes.set(yscale="linear", ylabel="probability of each answer", ylim=(0, 1))
+    axes.set(yscale="linear", ylabel="probability of each response", ylim=(0, 1))
 
 
 def _probabilities(reading, x):

@@ -48,7 +48,8 @@ __all__ = ["posterior_progress", "sets_on_map", "typical_person"]
 
 UNKNOWN = 0.8
 """Share of its standard deviation without answers above which a map is drawn as not sampled."""
-_MARKS = {"best": ("*", 170, RED), "mid": ("D", 45, ORANGE), "worst": ("X", 80, "white")}
+_MARKS = {"best": ("*", 12, RED, "white"), "mid": ("D", 6, ORANGE, "black"), "worst": ("X", 8, "white", "black")}
+"""Marker, size (points), colour and edge of each set; that of the best is the mark of an optimum."""
 
 
 def typical_person(analysis: Analysis) -> int:
@@ -108,10 +109,7 @@ def sets_on_map(
         for shown in points if third is None else [name]:
             _mark(axes, study, shown, points[shown])
         title(axes, "" if third is None else f"{third_words(study, third)} ({name})")
-    handles: list[Any] = [
-        Line2D([], [], linestyle="", marker=_MARKS[n][0], color=_MARKS[n][2], markeredgecolor="black", label=n)
-        for n in points
-    ]
+    handles: list[Any] = [_handle(name) for name in points]
     handles += [*answer_handles(study, np.concatenate(counts)), *map_handles(study)]
     if hatched:
         handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", label="hardly sampled"))
@@ -132,11 +130,22 @@ def _hatch(axes, values: Slice, prior: ArrayLike) -> bool:
 
 def _mark(axes, study, name, x):
     """Mark a point `x` (d,) of the unit cube as the set `name` ("best", "mid" or "worst") on `axes`."""
-    marker, size, colour = _MARKS[name]
-    look = {"marker": marker, "s": size, "color": colour, "edgecolor": "black", "linewidth": 0.7}
-    axes.scatter(
-        *np.asarray(study.space.to_physical(np.asarray(x)))[list(study.space.free[:2])], zorder=5, clip_on=False, **look
-    )
+    point = np.asarray(study.space.to_physical(np.asarray(x)))[list(study.space.free[:2])]
+    axes.plot(*point, zorder=5, clip_on=False, **_look(name))
+
+
+def _handle(name: str) -> Line2D:
+    """Legend handle of a set."""
+    marker, size, colour, edge = _MARKS[name]
+    look = Line2D([], [], marker=marker, color=colour, markeredgecolor=edge, linestyle="", label=name)
+    look.set_markersize(size)
+    return look
+
+
+def _look(name):
+    """Properties of the marker of a set."""
+    marker, size, colour, edge = _MARKS[name]
+    return {"marker": marker, "markersize": size, "color": colour, "markeredgecolor": edge, "linestyle": ""}
 
 
 @styled
@@ -145,10 +154,8 @@ def _sets_on_curve(study, surface, points):
     figure, axes = new_figure(ONE_COLUMN, 2.6)
     draw_curve(axes, study, curve(study, surface))
     for name, x in points.items():
-        marker, size, colour = _MARKS[name]
         physical = np.asarray(study.space.to_physical(np.asarray(x)))
         height = float(surface(jnp.asarray(x)[None, :])[0][0])
-        look = {"marker": marker, "s": size, "color": colour, "edgecolor": "black"}
-        axes.scatter(physical[study.space.free[0]], height, label=name, zorder=3, **look)
+        axes.plot(physical[study.space.free[0]], height, label=name, zorder=3, **_look(name))
     axes.legend(frameon=False)
     return figure

@@ -1,7 +1,8 @@
 """The style that all figures share: colours, widths, axes with units, marks of optima.
 
-Maps use cividis and lines the Okabe-Ito colours, which are distinguishable with colour-blindness; what differs
-does so by shape too. Widths are those of one and of two columns of a journal.
+All values on maps have one sequential colour map, lines the Okabe-Ito colours; both are distinguishable with
+colour-blindness, and what differs does so by shape too. The optimum is a red star everywhere, and red is the
+population. Widths are those of one and of two columns of a journal.
 """
 
 import io
@@ -18,6 +19,7 @@ from hilbo.study.config import Study
 
 __all__ = [
     "BLUE",
+    "COLOURS",
     "GREEN",
     "GREY",
     "ONE_COLUMN",
@@ -34,11 +36,14 @@ __all__ = [
     "plain",
     "score_label",
     "star",
+    "star_at",
     "styled",
     "title",
 ]
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
+COLOURS = "cividis"
+"""Name of the sequential colour map; the pages of a session (static/map.js) have the same."""
 ONE_COLUMN, TWO_COLUMNS = 3.46, 7.13
 """Widths of figures, inches."""
 STYLE: dict = {
@@ -113,8 +118,10 @@ def plain(words: str) -> str:
 
 
 def score_label(study: Study) -> str:
-    """Label of axes and colour bars for the latent function: the study's attribute and f."""
-    return f"{plain(study.file.attribute)} f"
+    """Label of axes and colour bars for the mean of the latent function, which has no unit: f and the study's
+    attribute.
+    """
+    return f"mean latent score f (no unit)\n{plain(study.file.attribute)}"
 
 
 def title(axes, text: str) -> None:
@@ -175,8 +182,15 @@ def level_words(study: Study, index: int, unit_value: float) -> str:
 def star(axes, study: Study, x, pair: tuple[int, ...] | None = None) -> None:
     """Draw a star at a point `x` (d,) of the unit cube on `axes` of the parameters `pair`, by default the first two
     free ones, in physical units."""
-    point = np.asarray(study.space.to_physical(np.asarray(x)))[list(pair or study.space.free[:2])]
-    axes.plot(*point, marker="*", markersize=12, color=RED, markeredgecolor="white", clip_on=False, zorder=5)
+    star_at(axes, *np.asarray(study.space.to_physical(np.asarray(x)))[list(pair or study.space.free[:2])])
+
+
+def star_at(axes, across: float, up: float, label: str = "") -> None:
+    """Draw the mark of an optimum, a red star with a white edge, at a point in data coordinates. `label`: in legends,
+    if there is one.
+    """
+    look = {"marker": "*", "markersize": 12, "color": RED, "markeredgecolor": "white", "linestyle": ""}
+    axes.plot([across], [up], clip_on=False, zorder=5, label=label or None, **look)
 
 
 def band(axes, trials, values, colour: str, label: str) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import BLUE, GREY, ORANGE, RED, TWO_COLUMNS, new_figure, plain, styled
+from hilbo.report.figures.style import BLUE, COLOURS, GREY, ORANGE, RED, TWO_COLUMNS, new_figure, plain, styled
 
 __all__ = ["aggregate_best_figure", "preference_rows", "validation_figure"]
 
@@ -42,7 +42,7 @@ def aggregate_best_figure(people: pd.DataFrame, overall: pd.DataFrame) -> Figure
     axes.scatter([best["rate"]], [0], s=50, marker="D", color=RED, zorder=3, label=f"all ({best['errors']})")
     axes.axvline(0.5, color=GREY, linestyle="--", linewidth=1)
     axes.set_yticks([*rows, 0], [*people["name"], "all"], fontsize=7)
-    axes.set(xlim=(0, 1), ylim=(-0.7, len(people) + 0.7), xlabel="share preferring the aggregate's set")
+    axes.set(xlim=(0, 1), ylim=(-0.7, len(people) + 0.7), xlabel="proportion preferring the aggregate's set")
     figure.legend(loc="outside upper center", ncols=2, frameon=False)
     return figure
 
@@ -72,13 +72,13 @@ def _matrix(axes, counts):
     """Draw a confusion matrix on `axes`: share of each row and count in each cell, a dash in rows without responses."""
     totals = counts.to_numpy().sum(axis=1, keepdims=True)
     shares = np.divide(counts.to_numpy(), totals, out=np.zeros(counts.shape), where=totals > 0)
-    axes.imshow(shares, cmap="cividis", vmin=0, vmax=1, aspect="auto")
+    axes.imshow(shares, cmap=COLOURS, vmin=0, vmax=1, aspect="auto")
     for (i, j), share in np.ndenumerate(shares):
         words = f"{100 * share:.0f} %\n{counts.iat[i, j]}" if totals[i, 0] else "–"
         axes.text(j, i, words, ha="center", va="center", color="white" if share < 0.6 else "black", fontsize=8)
     axes.set_xticks(range(counts.shape[1]), list(counts.columns))
     axes.set_yticks(range(counts.shape[0]), [str(name) for name in counts.index])
-    axes.set(xlabel="answer", ylabel="set")
+    axes.set(xlabel="response", ylabel="set")
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
 
@@ -86,7 +86,7 @@ def _matrix(axes, counts):
 def _rates(axes, rows):
     """Draw preference rates with their intervals on `axes`, one row for each pair; a text if there are none."""
     axes.axvline(0.5, color=GREY, linestyle="--", linewidth=1)
-    axes.set(xlim=(-0.02, 1.02), xlabel="share preferring the first")
+    axes.set(xlim=(-0.02, 1.02), xlabel="proportion preferring the first")
     if rows.empty:
         axes.text(0.5, 0.5, "no preferences", ha="center", transform=axes.transAxes)
         return

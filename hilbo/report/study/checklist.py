@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hilbo.population.rules.registry import RULES
+from hilbo.report.digits import parameter_text
 from hilbo.report.kernel_words import covariance_words, formula
-from hilbo.report.page import number, percent
+from hilbo.report.page import percent
 from hilbo.study.analysis.analysis import Analysis
 
 __all__ = ["Item", "checklist"]
@@ -102,8 +103,8 @@ def _computation(analysis, content):
 def _posterior(analysis, content):
     """Sentence with the optimum, its latent score and standard deviation."""
     best = content["optimum"]
-    where = ", ".join(f"{name} {number(value)}" for name, value in best["parameters"].items())
     study = analysis.study
+    where = ", ".join(f"{name} {parameter_text(study, name, value)}" for name, value in best["parameters"].items())
     definition = RULES[study.rule].optimum_for(study.goal_label, study.goal.is_highest)
     return (
         f"The optimum is, among the stimuli that may be presented, {definition}: {where}; latent score"

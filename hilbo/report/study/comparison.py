@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from hilbo.report.page import Pictures, heads, number, percent
+from hilbo.report.digits import parameter_texts
+from hilbo.report.page import Pictures, heads, percent
 from hilbo.report.result_file import as_json
 from hilbo.report.results import save_figures
 from hilbo.study.analysis.rule_comparison import KNOWN
@@ -66,19 +67,31 @@ def comparison_section(study: Study, content: Content) -> Content:
     compared = {rule: entry for rule, entry in rules.items() if "refused" not in entry}
     order = sorted(compared, key=lambda rule: compared[rule]["negative_log_density"])
     names = list(compared[order[0]]["optimum"])
-    head = ["rule", "negative log density", "difference", "in central 95 %", "mean square normal score (1: calibrated)"]
-    head += [f"space where sd < {percent(KNOWN)} of the prior's", "sd at the optimum", *heads(study, names)]
+    head = [
+        "method",
+        "negative log density",
+        "difference",
+        "in central 95 % (%)",
+        "mean square normal score (1: calibrated)",
+    ]
+    head += [f"space where sd < {percent(KNOWN)} of the prior's (%)", "sd at the optimum", *heads(study, names)]
     return {
         "words": content["recommendation"],
         "head": head,
-        "rows": [[rule, *_cells(compared[rule])] for rule in order],
+        "rows": [[rule, *_cells(study, compared[rule])] for rule in order],
         "refused": [f"{rule}: {entry['refused']}" for rule, entry in rules.items() if "refused" in entry],
     }
 
 
-def _cells(entry):
+def _cells(study, entry):
     """Cells of one method's row on the page, as texts; the best method has no difference."""
     best = entry["difference"] == 0.0
     difference = "" if best else f"{entry['difference']:+.3f} ± {entry['difference_error']:.3f}"
-    cells = [f"{entry['negative_log_density']:.3f}", difference, percent(entry["central_95"]), f"{entry['z2']:.2f}"]
-    return [*cells, percent(entry["covered"]), f"{entry['optimum_sd']:.2f}", *map(number, entry["optimum"].values())]
+    cells = [
+        f"{entry['negative_log_density']:.3f}",
+        difference,
+        f"{100 * entry['central_95']:.0f}",
+        f"{entry['z2']:.2f}",
+    ]
+    cells += [f"{100 * entry['covered']:.0f}", f"{entry['optimum_sd']:.2f}"]
+    return [*cells, *parameter_texts(study, entry["optimum"])]

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from hilbo.report.digits import rounded
 from hilbo.report.results import misses
 from hilbo.report.validation import Validated
 from hilbo.study.analysis.analysis import Analysis, moved_by_evidence
@@ -55,18 +56,16 @@ def key_numbers_table(analysis: Analysis, rows: list[KeyNumber]) -> pd.DataFrame
 
 def _other(value: str | float, unit: str) -> str:
     """A text of `[report] compare_with`, or a number with its unit, with all of its digits."""
-    return value if isinstance(value, str) else f"{value:.12g}{_unit(unit)}"
-
-
-def _unit(unit: str) -> str:
-    """A unit behind a number, with a blank; nothing for a number of answers, whose row says what it counts."""
-    return "" if unit == "answers" else f" {unit}"
+    return value if isinstance(value, str) else f"{value:.12g}" + ("" if unit == "answers" else f" {unit}")
 
 
 def key_numbers_words(table: pd.DataFrame) -> list[list[str]]:
-    """Rows of the page's table, as texts: result, value with its range, and what it is compared with where the study
-    file has anything."""
-    rows = [[row.result, _words(row), row.compared_with] for row in table.itertuples(index=False)]
+    """Rows of the page's table, as texts: result with its unit, value with its range, and what it is compared with
+    where the study file has anything."""
+    rows = [
+        [_head(row), _words(row), row.compared_with.removesuffix(f" {row.unit}")]
+        for row in table.itertuples(index=False)
+    ]
     return rows if table["compared_with"].any() else [row[:2] for row in rows]
 
 
@@ -126,18 +125,21 @@ def _validation(analysis: Analysis, validated: Validated) -> Iterator[KeyNumber]
         yield KeyNumber("preferred", words, share, low, high, "95 % interval")
 
 
+def _head(row) -> str:
+    """Name of a row of the table, with the unit of its numbers; a number of responses has none."""
+    return row.result if row.unit == "answers" else f"{row.result} ({row.unit})"
+
+
 def _words(row) -> str:
-    """Value of a row of the table with its range, as text."""
-    unit = _unit(row.unit)
+    """Value of a row of the table with its range, as text without the unit: with the digits of the range, without one
+    with one decimal.
+    """
     if not np.isfinite(row.value):
         return "–"
     if not np.isfinite(row.low) or not np.isfinite(row.high):
-        return f"{_text(row.value)}{unit}"
+        return f"{row.value:.1f}"
+    value, low, high = (rounded(x, row.high - row.low) for x in (row.value, row.low, row.high))
     if row.range == "standard deviation":
-        return f"{_text(row.value)} ± {_text(row.high - row.value)}{unit}"
-    return f"{_text(row.value)}{unit} ({row.range}: {_text(row.low)} to {_text(row.high)}{unit})"
-
-
-def _text(value: float) -> str:
-    """A number with three significant digits."""
-    return f"{value:.3g}"
+        sd = row.high - row.value
+        return f"{rounded(row.value, sd)} ± {rounded(sd, sd)}"
+    return f"{value} ({row.range}: {low} to {high})"

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from hilbo.report import validation
-from hilbo.report.page import Pictures, estimate_words, heads, number, percent, rendered
+from hilbo.report.page import Pictures, rendered
 from hilbo.report.participants import people_of
 from hilbo.report.result_file import write_result
 from hilbo.report.results import cohort_content, optima_table, save_figures, versions, write_grid
@@ -24,22 +24,19 @@ from hilbo.report.study.comparison import comparison_section, comparison_table
 from hilbo.report.study.dictionary import dictionary
 from hilbo.report.study.hypotheses import Results, hypotheses
 from hilbo.report.study.key_numbers import key_numbers, key_numbers_table, key_numbers_words
+from hilbo.report.study.page_tables import alternatives_rows, measures_rows, table_1_rows, tolerance_rows
 from hilbo.report.study.result_tables import alternatives_table, convergence_table, table_1, tolerance_table
 from hilbo.report.study.sessions import SESSIONS_HEAD, described, session_rows
 from hilbo.report.study.study_figures import comparison_figures, study_figures
 from hilbo.report.validation import Validated, folder_names, named_warnings, validate
 from hilbo.study.analysis.analysis import Analysis, analyse, moved_by_evidence
 from hilbo.study.analysis.heterogeneity import how_aggregated
-from hilbo.study.config import Study
 from hilbo.study.file.trial_flags import flag_sentences
 from hilbo.study.folder import Material, StudyFolder
 from hilbo.study.results.arviz_groups import groups, predictive_shares, write_groups
 from hilbo.study.results.map_netcdf import map_dataset
-from hilbo.study.tables.parameter_sets import ROLES
 
 __all__ = ["write_study"]
-
-_DIGITS = 2  # of measures of people and of ends of intervals, which a few dozen answers decide
 
 
 def write_study(
@@ -100,7 +97,7 @@ def _page(folder: StudyFolder, content, sections, claims, compares: bool) -> str
         "study.html",
         study=folder.study,
         content=content,
-        warnings=[*content["warnings"], *content["limits"]],
+        warnings=content["limits"],  # those of the materials are footnotes of their cards
         notes=folder.notes,
         sections=sections,
         people=len(kept),
@@ -235,10 +232,10 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "how": how_aggregated(analysis.aggregate.map),
         "reference": None if material.reference is None else material.reference.name,
         "key_numbers": key_numbers_words(tables["key_numbers"]),
-        "table_1": _with_units(analysis.study, tables["table_I"]),
-        "alternatives": _alternatives(analysis.study, tables["alternatives"]),
-        "tolerance": _tolerances(tables["tolerance"].replace({"hyperparameters": words})),
-        "people": _shown(tables["people"].drop(columns=["categories", "left_out"]), digits=_DIGITS),
+        "table_1": table_1_rows(analysis.study, tables["table_I"]),
+        "alternatives": alternatives_rows(analysis.study, tables["alternatives"]),
+        "tolerance": tolerance_rows(analysis.study, tables["tolerance"].replace({"hyperparameters": words})),
+        "people": measures_rows(tables["people"].drop(columns=["categories", "left_out"])),
         "moved": content["optimised"]["nrmse"],
         "criterion": content["optimised"]["criterion"],
         "model_check": content["model_check"],
@@ -249,76 +246,3 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "halves": analysis.progress.splits,
         "validation": None if validated is None else validation.validation_section(validated),
     }
-
-
-def _alternatives(study: Study, table: pd.DataFrame) -> dict[str, Any]:
-    """Head and rows (texts) of the page's table of all optima, without empty columns. `table`: of
-    `alternatives_table`.
-    """
-    forms: dict[str, tuple[str, Any]] = {
-        "mean": ("latent score", "{:.2f}".format),
-        "sd": ("sd", "{:.2f}".format),
-        "p_top": (f'P("{study.goal_label}")', percent),
-        "passivity_margin": ("passivity margin (N·s/m)", "{:+.3f}".format),
-    }
-    shown = table.dropna(axis=1, how="all").drop(columns="optimum")
-    parameters = [name for name in shown if name not in forms]
-    names = dict(zip(parameters, heads(study, parameters), strict=True)) | {k: head for k, (head, _) in forms.items()}
-    rows = [
-        [
-            _estimate(label, study.rule),
-            *("" if pd.isna(value) else forms.get(name, ("", number))[1](value) for name, value in row.items()),
-        ]
-        for label, row in zip(table["optimum"], shown.to_dict("records"), strict=True)
-    ]
-    return {"head": ["", *(names[name] for name in shown)], "rows": rows}
-
-
-def _estimate(label: str, rule: str) -> str:
-    """Name on the page for the `label` of a row of `alternatives_table`; `rule`: the study's aggregation method."""
-    if label in ROLES:
-        return f"{label} of the sets to compare"
-    name = "aggregate" if label == "population" else label.removeprefix("population, ")
-    return name if " " in name else estimate_words(name, rule)
-
-
-def _with_units(study: Study, table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
-    """Columns and cells (texts) of a table whose column `parameter` gets units."""
-    return _shown(table.assign(parameter=heads(study, table["parameter"])))
-
-
-def _shown(table: pd.DataFrame, digits: int = 4) -> tuple[list[str], list[list[str]]]:
-    """Column names and cells of a table as texts, numbers with so many significant digits."""
-    return list(map(str, table.columns)), [
-        [_cell(value, digits) for value in row] for row in table.itertuples(index=False)
-    ]
-
-
-def _tolerances(table):
-    """Rows (texts) of the page's table of tolerance intervals: each end with its reason and its bootstrap interval, and
-    the share of resamples without an interval; dashes for missing items.
-    """
-    rows = []
-    for row in table.to_dict("records"):
-        resampled = np.isfinite(row["draws_without"])  # not of one person
-        ends = [
-            [
-                f"{_cell(row[end])} ({row[f'{end}_end']})",
-                " to ".join(_cell(row[f"{end}_{side}"], _DIGITS) for side in ("from", "to")) if resampled else "–",
-            ]
-            if np.isfinite(row[end])
-            else ["–", "–"]
-            for end in ("low", "high")
-        ]
-        without = percent(row["draws_without"]) if resampled else "–"
-        rows.append([row["hyperparameters"], row["parameter"], *ends[0], *ends[1], without])
-    return rows
-
-
-def _cell(value, digits=4):
-    """A value as text: numbers with so many significant digits, "–" for None and NaN, "∞" or "−∞" for infinity."""
-    if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
-        return "–" if value is None or np.isnan(value) else ("∞" if value > 0 else "−∞")
-    if isinstance(value, float | np.floating):
-        return np.format_float_positional(value, precision=digits, unique=False, fractional=False, trim="-")
-    return str(value)
