@@ -89,7 +89,7 @@ shows their distance.""",
                 "report/population-convergence.png",
                 "Convergence: to the last place of the optimum, and between split halves.",
             ),
-            ("report/classes.png", "The likeliest answer of a new participant, and tolerance intervals."),
+            ("report/classes.png", "Most probable response of a new participant, and tolerance intervals."),
         ),
     ),
 )

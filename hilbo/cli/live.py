@@ -87,7 +87,7 @@ def session(
 ) -> None:
     """Run a live session: participant's and experimenter's page, device or stimulus program, and the log.
 
-    Prints one-time links on stderr, and serves until Ctrl-C.
+    Prints one-time links and progress on stderr, and serves until Ctrl-C.
     """
     need_extra()
     from hilbo.app.server import serve
@@ -100,6 +100,7 @@ def session(
             say("loading")
             start()
             from hilbo.app.hub.opening import Wanted, let_go, opened
+            from hilbo.cli.terminal.session_lines import SessionLines
             from hilbo.session.log.log_files import keys_path
 
             wanted = Wanted(
@@ -112,6 +113,7 @@ def session(
             raise InputError(f"{study}: a program or a person presents, and no device is used; leave --device out.")
         hub.gap = served.gap
         _say_changes(study, hub.state.study)
+        hub.told = SessionLines(study, served.logs)
         _serve(hub, place, served, as_json)
 
 

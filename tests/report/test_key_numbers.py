@@ -65,7 +65,7 @@ def test_the_page_puts_what_the_study_names_beside(analysed):
     assert words["Population optimum: error to the truth (NRMSE) (%)"] == ["7.9", "4"]
     own = next(value for name, value in words.items() if name.startswith("Individual"))
     assert "(quartiles: " in own[0] and own[1] == "24 (13 to 41)"
-    assert words['Answers "close" of 4 per participant, mean'] == ["1.5 ± 1.0", ""]
+    assert words['Responses "close" of 4 per participant, mean'] == ["1.5 ± 1.0", ""]
     assert words["Preferred (%)"] == ["–", "72.75"]  # without a validation
     alone = key_numbers_words(table.assign(compared_with=""))
     assert all(len(row) == 2 for row in alone)

@@ -27,7 +27,7 @@ from hilbo.app.wire.security import Role
 from hilbo.app.wire.watchers import Watchers
 from hilbo.session.log import actions
 from hilbo.session.log.event_log import LogError, LogLostError
-from hilbo.session.log.records import RefusedError
+from hilbo.session.log.records import Event, RefusedError
 from hilbo.session.log.state import LiveSession
 
 __all__ = ["PRESSES", "Hub"]
@@ -43,8 +43,9 @@ class Hub:
     `connect(changed, notice)` makes the rig, which calls `changed` with each new snapshot and `notice` with each
     sentence that a device sends unasked; `maps(chooser)` makes the `Maps`, None for a session without a map.
 
-    `invite`, once set, makes a new link for a role; `settle`, once set, is called when everything is compiled, before
-    anything is presented; `gap` (s) is the pause between two trials; `tag` is the prefix of the trials' names in
+    `invite`, once set, makes a new link for a role; `told`, once set, is called with the state before each event of the
+    log, the event, and the state after it, and must neither raise nor wait; `settle`, once set, is called when
+    everything is compiled, before anything is presented; `gap` (s) is the pause between two trials; `tag` is the prefix of the trials' names in
     browsers.
     """
 
@@ -69,6 +70,7 @@ class Hub:
         self.recent: deque = deque(reversed(log.before[-_RECENT:]), maxlen=_RECENT)
         self.delays: list[dict[str, float]] = []  # s, from each answer on
         self.invite: Callable[[Role], dict[str, str]] | None = None
+        self.told: Callable[[LiveSession, Event, LiveSession], Any] = lambda before, event, after: None
         self.settle: Callable[[], Any] = lambda: None
         self._connect, self._make_maps, self._maps = connect, maps, None
         self._warming: asyncio.Future | None = None
@@ -174,13 +176,14 @@ class Hub:
             event = make(self.state, time.time())
             if event is None:
                 return None
-            before = self.runner.key()
+            before, key = self.state, self.runner.key()
             self.state = await self._on_disk(self.log.append, event)
+            self.told(before, event, self.state)
             self.alert = None
             self.recent.appendleft(event)
             if event.kind == "answer":
                 self.runner.clock = {"came": self._came, "logged": time.perf_counter(), "fsync": self.log.sync_s}
-        if not mine and self.runner.key() != before:
+        if not mine and self.runner.key() != key:
             self.runner.restart()
         self.publish()
         return event

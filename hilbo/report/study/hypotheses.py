@@ -7,8 +7,8 @@ or if it is equal for all of them. Items are not
 counted, and none is a test by itself. Only a study that asks for it has this
 section (`[report] hypotheses = true`): the hypotheses are the paper's.
 
-    H1  individuals' parameters can be found by asking      H3  individuals need not have converged for that
-    H2  a population's map has an optimum that people share  H4  it applies to other materials
+    H1  individual parameters are found from responses    H3  individual convergence is not required for that
+    H2  the population map's optimum is broadly shared    H4  the same applies to other materials
 
 The page has the hypotheses in full.
 """
@@ -132,8 +132,8 @@ def _individuals(results):
     more = _difference(late - early)
     yield Evidence(
         more.side if longest >= 6 else "inconclusive",
-        f'Of {longest} trials, {totals.mean():.2f}{spread} were answered "{top}"; in the first third of the session'
-        f" {early.mean():.0f} % of the answers, in the last third {late.mean():.0f} %, means over participants; more by"
+        f'Of {longest} responses, {totals.mean():.2f}{spread} are "{top}"; in the first third of the session'
+        f" {early.mean():.0f} % of the responses, in the last third {late.mean():.0f} % (means over participants); difference"
         f" {more} (supports: an interval above 0).",
     )
     chances = np.asarray(analysis.aggregate.individuals.class_probabilities)
@@ -141,7 +141,7 @@ def _individuals(results):
     likeliest, unlike = sides.count("supports"), sides.count("contradicts")
     yield Evidence(
         "supports" if likeliest > people / 2 else "contradicts" if unlike > people / 2 else "inconclusive",
-        f'At their own optimum "{top}" is the likeliest answer for {likeliest} of {people} participants (median'
+        f'At the individual optimum "{top}" is the most probable response of {likeliest} of {people} participants (median'
         f" probability {100 * np.median(chances[:, study.goal.category]):.0f} %; supports: more than half of them).",
     )
 
@@ -155,9 +155,9 @@ def _nearer_to_others(progress):
     nearer = _difference(early - late)
     return Evidence(
         nearer.side,
-        f"From the optimum of a half of the people without them, individual optima are {np.median(early):.0f} % away"
+        f"The distance of individual optima from the optimum of half of the other participants is {np.median(early):.0f} %"
         f" after {progress.counts[row]} trials and {np.median(late):.0f} % after {progress.counts[-1]} (NRMSE,"
-        f" medians); they come nearer by {nearer} on average (supports: an interval above 0).",
+        f" medians); it falls by {nearer} on average (supports: an interval above 0).",
     )
 
 
@@ -198,7 +198,7 @@ def _likeliest(analysis):
     """
     highest, goal = analysis.population.highest, analysis.study.goal
     if highest is None:
-        words = f"The rule {analysis.study.rule} does not predict a new participant's answers."
+        words = f"The method {analysis.study.rule} does not predict a new participant's responses."
         return Evidence("inconclusive", words)
     chances = np.asarray(analysis.aggregate.optimum.class_probabilities)
     side = _largest(chances, goal.category)
@@ -206,9 +206,9 @@ def _likeliest(analysis):
         side = "inconclusive"
     return Evidence(
         side,
-        f'At the population optimum a new participant answers "{analysis.study.goal_label}" with a probability of'
-        f" {highest.probability:.0%} (95 % interval {highest.low:.0%} to {highest.high:.0%}; supports: more likely"
-        " than any other answer).",
+        f'At the population optimum a new participant responds "{analysis.study.goal_label}" with a probability of'
+        f" {highest.probability:.0%} (95 % interval {highest.low:.0%} to {highest.high:.0%}; supports: more probable"
+        " than any other response).",
     )
 
 
@@ -223,13 +223,13 @@ def _validation(validated, study, numbers=("II", "III", "IV")):
             "contradicts" if "contradicts" in sides else "inconclusive" if "inconclusive" in sides else "supports",
             f'Best, mid and worst were called "{responses[-1]}", "{responses[1]}" and "{responses[0]}" in'
             f" {', '.join(f'{100 * v:.0f} %' for v in np.diagonal(counts) / counts.sum(axis=1))} of the cases"
-            " (supports: each is the most frequent answer to its set).",
+            " (supports: each is the most frequent response to its set).",
         )
     for number, term, words, sign in (
         ("II", "Best", f'the best set is called "{goal}" more often than the others', 1),
         ("III", "Best", f'the best set differs from the mid set, towards "{goal}"', -1),
         ("III", "Worst", f'the worst set differs from the mid set, away from "{goal}"', 1),
-        ("IV", "Aggregate-Best", "the aggregate's set is preferred to individuals' own", 1),
+        ("IV", "Aggregate-Best", "the population optimum is preferred to individual optima", 1),
     ):
         table = validated.regressions().get(number)
         if table is None or number not in numbers:
@@ -292,7 +292,7 @@ def _materials(results):
             own = _validation(one.validated, one.analysis.study, _STAGED)
             items += [Evidence(item.side, f"{one.name}: {item.text}") for item in own]
             items += _preferred(one.name, one.validated)
-        words = f"{one.name}: there is no reference, and no decided comparison of the map's set with individuals'."
+        words = f"{one.name}: there is no reference, and no decided comparison of the population optimum with individual optima."
         yield from items or [Evidence("inconclusive", words)]
 
 
@@ -323,7 +323,7 @@ def _preferred(name, validated):
     side: Side = "supports" if row["low"] > 0 else "contradicts" if row["high"] < 0 else "inconclusive"
     yield Evidence(
         side,
-        f"{name}: the aggregate's set was preferred in {100 * validated.overall['rate'].iloc[0]:.1f} % of the decided"
+        f"{name}: the population optimum was preferred in {100 * validated.overall['rate'].iloc[0]:.1f} % of the decided"
         f" comparisons ({int(validated.people['ties'].sum())} ties; table IV: {row['estimate']:.2f}, 95 % interval"
         f" {row['low']:.2f} to {row['high']:.2f}).",
     )

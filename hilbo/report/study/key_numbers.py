@@ -1,4 +1,4 @@
-"""Key results of one material as a table: errors, answers, validation, next to those of another study.
+"""Key results of one material as a table: errors, responses, validation, next to those of another study.
 
 The rows are those that the paper prints about its study. The interval of a reference set, as `hilbo identify` writes it
 beside the values, gives the range of errors to any set within it.
@@ -100,12 +100,12 @@ def _distances(
 
 
 def _goal_answers(analysis: Analysis) -> KeyNumber:
-    """Number of answers per participant that are the goal: mean, and a standard deviation on either side."""
+    """Number of responses per participant that are the goal: mean, and a standard deviation on either side."""
     trials, goal = analysis.cohort.trials, analysis.study.goal
     counts = (np.asarray(trials.q == goal.category) & np.asarray(trials.mask)).sum(axis=1)
     mean, sd = float(counts.mean()), float(counts.std(ddof=1)) if len(counts) > 1 else np.nan
     longest = int(analysis.cohort.counts().max())
-    words = f'Answers "{analysis.study.goal_label}" of {longest} per participant, mean'
+    words = f'Responses "{analysis.study.goal_label}" of {longest} per participant, mean'
     return KeyNumber("goal_answers", words, mean, mean - sd, mean + sd, "standard deviation", "answers")
 
 

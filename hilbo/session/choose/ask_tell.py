@@ -55,10 +55,10 @@ def _to_unit(space, physical):
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """A participant's answers so far and the rendering to ask next; made by `start`, `tell` and `replay`.
+    """A participant's responses so far and the next stimulus; made by `start`, `tell` and `replay`.
 
     `points` (n, d) are in physical units, `answers` (n,) categories from 0; `proposal` (d,) is the next point, None
-    when all the study's trials are answered.
+    when all the study's trials have a response.
     """
 
     study: Study
@@ -83,7 +83,7 @@ class Session:
 
     @classmethod
     def start(cls, study: Study, seed: int = 0) -> "Session":
-        """A session without answers. The seed decides the space-filling trials and the candidates.
+        """A session without responses. The seed decides the space-filling trials and the candidates.
 
         Raises `InputError` for a `study` that has not been loaded, and a `seed` that is no whole number from 0.
         """
