@@ -6,7 +6,8 @@ Methods of `pointwise` combine the individual posteriors point by point. Others 
 - `hierarchical`, where the responses are few enough: the posterior of the shared function g, exact (`shared`); point by
   point otherwise, at the committee machine's cost.
 - `pooled`: one function for all participants.
-- `learnt-1`, `learnt-2`, `learnt-3`: hierarchical, with hyperparameters that are learnt from the responses as well (`learnt`).
+- `learnt-1`, `learnt-2`, `learnt-3`: hierarchical, with hyperparameters that are learnt from the responses as well
+  (`learnt`).
 
 The share is learnt by evidence, from evenly spaced participants if there are many, and its posterior mean is used: the
 most probable share may be 0 or 1, where nothing, or everything, would be common.

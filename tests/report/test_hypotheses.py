@@ -28,7 +28,7 @@ def test_a_tie_of_answers_says_nothing_whichever_way_the_scale_runs(counts, side
         tables = SimpleNamespace(confusion=pd.DataFrame(np.array(counts)[::way, ::way]))
         (item,) = _validation(SimpleNamespace(tables=tables, regressions=dict), plain())
         assert item.side == side
-        assert item.text.endswith("of the cases (supports: each is the most frequent answer to its set).")
+        assert item.text.endswith("of the cases (supports: each is the most frequent response to its set).")
 
 
 @pytest.mark.parametrize(

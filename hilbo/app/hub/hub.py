@@ -45,8 +45,8 @@ class Hub:
 
     `invite`, once set, makes a new link for a role; `told`, once set, is called with the state before each event of the
     log, the event, and the state after it, and must neither raise nor wait; `settle`, once set, is called when
-    everything is compiled, before anything is presented; `gap` (s) is the pause between two trials; `tag` is the prefix of the trials' names in
-    browsers.
+    everything is compiled, before anything is presented; `gap` (s) is the pause between two trials; `tag` is the prefix
+    of the trials' names in browsers.
     """
 
     def __init__(

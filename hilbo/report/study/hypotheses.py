@@ -133,16 +133,16 @@ def _individuals(results):
     yield Evidence(
         more.side if longest >= 6 else "inconclusive",
         f'Of {longest} responses, {totals.mean():.2f}{spread} are "{top}"; in the first third of the session'
-        f" {early.mean():.0f} % of the responses, in the last third {late.mean():.0f} % (means over participants); difference"
-        f" {more} (supports: an interval above 0).",
+        f" {early.mean():.0f} % of the responses, in the last third {late.mean():.0f} % (means over participants);"
+        f" difference {more} (supports: an interval above 0).",
     )
     chances = np.asarray(analysis.aggregate.individuals.class_probabilities)
     sides = [_largest(row, study.goal.category) for row in chances]
     likeliest, unlike = sides.count("supports"), sides.count("contradicts")
     yield Evidence(
         "supports" if likeliest > people / 2 else "contradicts" if unlike > people / 2 else "inconclusive",
-        f'At the individual optimum "{top}" is the most probable response of {likeliest} of {people} participants (median'
-        f" probability {100 * np.median(chances[:, study.goal.category]):.0f} %; supports: more than half of them).",
+        f'At the individual optimum "{top}" is the most probable response of {likeliest} of {people} participants'
+        f" (median probability {100 * np.median(chances[:, study.goal.category]):.0f} %; supports: more than half of them).",
     )
 
 
@@ -155,8 +155,8 @@ def _nearer_to_others(progress):
     nearer = _difference(early - late)
     return Evidence(
         nearer.side,
-        f"The distance of individual optima from the optimum of half of the other participants is {np.median(early):.0f} %"
-        f" after {progress.counts[row]} trials and {np.median(late):.0f} % after {progress.counts[-1]} (NRMSE,"
+        "The distance of individual optima from the optimum of half of the other participants is"
+        f" {np.median(early):.0f} % after {progress.counts[row]} trials and {np.median(late):.0f} % after {progress.counts[-1]} (NRMSE,"
         f" medians); it falls by {nearer} on average (supports: an interval above 0).",
     )
 
@@ -292,7 +292,10 @@ def _materials(results):
             own = _validation(one.validated, one.analysis.study, _STAGED)
             items += [Evidence(item.side, f"{one.name}: {item.text}") for item in own]
             items += _preferred(one.name, one.validated)
-        words = f"{one.name}: there is no reference, and no decided comparison of the population optimum with individual optima."
+        words = (
+            f"{one.name}: there is no reference, and no decided comparison of the population optimum with individual"
+            " optima."
+        )
         yield from items or [Evidence("inconclusive", words)]
 
 
@@ -323,7 +326,7 @@ def _preferred(name, validated):
     side: Side = "supports" if row["low"] > 0 else "contradicts" if row["high"] < 0 else "inconclusive"
     yield Evidence(
         side,
-        f"{name}: the population optimum was preferred in {100 * validated.overall['rate'].iloc[0]:.1f} % of the decided"
-        f" comparisons ({int(validated.people['ties'].sum())} ties; table IV: {row['estimate']:.2f}, 95 % interval"
+        f"{name}: the population optimum was preferred in {100 * validated.overall['rate'].iloc[0]:.1f} % of the"
+        f" decided comparisons ({int(validated.people['ties'].sum())} ties; table IV: {row['estimate']:.2f}, 95 % interval"
         f" {row['low']:.2f} to {row['high']:.2f}).",
     )
