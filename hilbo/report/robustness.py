@@ -128,7 +128,7 @@ def _figures(study, cohort, check):
     both = {"fixed hyperparameters": fixed, "by maximum evidence": optimised}
     best = np.stack([check.fixed.optimum.x, check.optimised.optimum.x])
     return {
-        "maps": maps.maps_beside(study, both, best),
+        "maps": maps.maps_beside(study, both, best, own_scales=True),
         "moves": maps.moved_optima(cohort.names, check.individual_nrmse, check.nrmse, LIMIT),
     }
 

@@ -116,10 +116,13 @@ def slices_after(study: Study, progress: Progress) -> Figure:
     return maps_beside(study, maps, progress.population[progress.at(progress.moments)])
 
 
-def maps_beside(study: Study, maps: Mapping[str, Surface], optima: Float[np.ndarray, "k d"]) -> Figure:
-    """Named population maps side by side, each sliced through its own optimum (the star), on one colour scale.
+def maps_beside(
+    study: Study, maps: Mapping[str, Surface], optima: Float[np.ndarray, "k d"], *, own_scales: bool = False
+) -> Figure:
+    """Named population maps side by side, each sliced through its own optimum (the star).
 
-    `optima` (k, d): in the unit cube, in the order of the maps. With one parameter the means are curves on one panel.
+    `optima` (k, d): in the unit cube, in the order of the maps; `own_scales`: each map has a colour scale of its own,
+    as for latent scores of different hyperparameters. With one parameter the means are curves on one panel.
     """
     if len(study.space.free) == 1:
         return _curves_beside(study, maps, optima)
@@ -128,7 +131,7 @@ def maps_beside(study: Study, maps: Mapping[str, Surface], optima: Float[np.ndar
     grids = [
         grid_slice(study, surface, x, third) for surface, x, third in zip(maps.values(), optima, thirds, strict=True)
     ]
-    figure, panels, draw = map_panels(study, grids)
+    figure, panels, draw = map_panels(study, grids, own_scales=own_scales)
     for axes, name, x, third, values in zip(panels, maps, optima, thirds, grids, strict=True):
         draw(axes, values)
         star(axes, study, x)
@@ -200,19 +203,23 @@ def _slice_values(parameter, third):
 
 
 @styled
-def map_panels(study: Study, grids):
+def map_panels(study: Study, grids, *, own_scales: bool = False):
     """A figure with a panel for each grid, its list of panels (axes), and a function (axes, grid) that draws a grid on
     one.
 
-    `grids`: of `grid_slice`; all have one colour scale. Contours are drawn only between numeric parameters.
+    `grids`: of `grid_slice`; all have one colour scale, unless `own_scales`. Contours are drawn only between numeric
+    parameters.
     """
-    heights = np.concatenate([g.mean.ravel() for g in grids])
-    low, high = np.nanmin(heights), np.nanmax(heights)
     size = (ONE_COLUMN, 2.9) if len(grids) == 1 else (TWO_COLUMNS, 2.6)
     figure, ((*panels,),) = new_figure(*size, 1, len(grids), sharey=True, squeeze=False)
-    scale = ScalarMappable(Normalize(low, high), COLOURS)
-    bar = figure.colorbar(scale, ax=panels, label=score_label(study), fraction=0.05, pad=0.02)
-    few_ticks(bar.ax.yaxis, 5)
+    scales = {}
+    together = [([axes], [grid]) for axes, grid in zip(panels, grids, strict=True)] if own_scales else [(panels, grids)]
+    for shared, of in together:
+        heights = np.concatenate([g.mean.ravel() for g in of])
+        scale = ScalarMappable(Normalize(np.nanmin(heights), np.nanmax(heights)), COLOURS)
+        scales |= dict.fromkeys(shared, scale.norm)
+        label = score_label(study) if shared[-1] is panels[-1] else ""
+        few_ticks(figure.colorbar(scale, ax=shared, label=label, fraction=0.05, pad=0.02).ax.yaxis, 5)
     for axes in panels:
         label_axes(axes, study, *study.space.free[:2])
     for axes in panels[1:]:
@@ -220,7 +227,7 @@ def map_panels(study: Study, grids):
 
     def draw(axes, values):
         mean, sd, sides = values
-        axes.pcolormesh(*sides, mean, cmap=COLOURS, norm=scale.norm, shading="nearest", rasterized=True)
+        axes.pcolormesh(*sides, mean, cmap=COLOURS, norm=scales[axes], shading="nearest", rasterized=True)
         # Nothing may be rendered, or nothing is between the steps.
         if np.isnan(mean).all() or min(mean.shape) < 2 or not _has_lines(study):
             return

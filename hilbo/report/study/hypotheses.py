@@ -142,7 +142,8 @@ def _individuals(results):
     yield Evidence(
         "supports" if likeliest > people / 2 else "contradicts" if unlike > people / 2 else "inconclusive",
         f'At the individual optimum "{top}" is the most probable response of {likeliest} of {people} participants'
-        f" (median probability {100 * np.median(chances[:, study.goal.category]):.0f} %; supports: more than half of them).",
+        f" (median probability {100 * np.median(chances[:, study.goal.category]):.0f} %; supports: more than half of"
+        " them).",
     )
 
 
@@ -156,8 +157,8 @@ def _nearer_to_others(progress):
     return Evidence(
         nearer.side,
         "The distance of individual optima from the optimum of half of the other participants is"
-        f" {np.median(early):.0f} % after {progress.counts[row]} trials and {np.median(late):.0f} % after {progress.counts[-1]} (NRMSE,"
-        f" medians); it falls by {nearer} on average (supports: an interval above 0).",
+        f" {np.median(early):.0f} % after {progress.counts[row]} trials and {np.median(late):.0f} % after"
+        f" {progress.counts[-1]} (NRMSE, medians); it falls by {nearer} on average (supports: an interval above 0).",
     )
 
 
@@ -327,6 +328,6 @@ def _preferred(name, validated):
     yield Evidence(
         side,
         f"{name}: the population optimum was preferred in {100 * validated.overall['rate'].iloc[0]:.1f} % of the"
-        f" decided comparisons ({int(validated.people['ties'].sum())} ties; table IV: {row['estimate']:.2f}, 95 % interval"
-        f" {row['low']:.2f} to {row['high']:.2f}).",
+        f" decided comparisons ({int(validated.people['ties'].sum())} ties; table IV: {row['estimate']:.2f}, 95 %"
+        f" interval {row['low']:.2f} to {row['high']:.2f}).",
     )
