@@ -100,7 +100,7 @@ def session(
             say("loading")
             start()
             from hilbo.app.hub.opening import Wanted, let_go, opened
-            from hilbo.cli.terminal.session_lines import SessionLines
+            from hilbo.app.pages.session_lines import SessionLines
             from hilbo.session.log.log_files import keys_path
 
             wanted = Wanted(
@@ -113,7 +113,7 @@ def session(
             raise InputError(f"{study}: a program or a person presents, and no device is used; leave --device out.")
         hub.gap = served.gap
         _say_changes(study, hub.state.study)
-        hub.told = SessionLines(study, served.logs)
+        hub.observe = SessionLines(study, served.logs)
         _serve(hub, place, served, as_json)
 
 

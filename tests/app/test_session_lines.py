@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 from live import Driver
 
-from hilbo.cli.terminal.session_lines import SessionLines, line_of
+from hilbo.app.pages.session_lines import SessionLines, line_of
 from hilbo.session.log import actions as live
 from hilbo.session.log.state import LiveSession
 

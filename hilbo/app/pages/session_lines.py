@@ -13,6 +13,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+from hilbo.app.pages.log_words import sentence
+
 __all__ = ["SessionLines", "line_of"]
 
 _PARTS = 4  # of a session, after each of which there is a line
@@ -46,8 +48,6 @@ def line_of(before: Any, event: Any, after: Any, export: str) -> str:
 
     `before`, `after`: `LiveSession`; `export`: the command that makes tables of the logs.
     """
-    from hilbo.app.pages.log_words import sentence
-
     if after.screen == "done" and before.screen != "done":
         return f"All trials have a response. Ctrl-C ends the server; then {export}"
     match event.kind:
