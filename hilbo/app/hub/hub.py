@@ -43,8 +43,8 @@ class Hub:
     `connect(changed, notice)` makes the rig, which calls `changed` with each new snapshot and `notice` with each
     sentence that a device sends unasked; `maps(chooser)` makes the `Maps`, None for a session without a map.
 
-    `invite`, once set, makes a new link for a role; `observe`, once set, is called with the state before each event of the
-    log, the event, and the state after it, and must neither raise nor wait; `settle`, once set, is called when
+    `invite`, once set, makes a new link for a role; `observe`, once set, is called with the state before each event of
+    the log, the event, and the state after it, and must neither raise nor wait; `settle`, once set, is called when
     everything is compiled, before anything is presented; `gap` (s) is the pause between two trials; `tag` is the prefix
     of the trials' names in browsers.
     """
@@ -70,7 +70,7 @@ class Hub:
         self.recent: deque = deque(reversed(log.before[-_RECENT:]), maxlen=_RECENT)
         self.delays: list[dict[str, float]] = []  # s, from each answer on
         self.invite: Callable[[Role], dict[str, str]] | None = None
-        self.observe: Callable[[LiveSession, Event, LiveSession], Any] = lambda before, event, after: None
+        self.observe: Callable[[LiveSession, Event, LiveSession], None] = lambda before, event, after: None
         self.settle: Callable[[], Any] = lambda: None
         self._connect, self._make_maps, self._maps = connect, maps, None
         self._warming: asyncio.Future | None = None

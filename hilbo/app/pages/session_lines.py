@@ -11,9 +11,10 @@ from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
 
 from hilbo.app.pages.log_words import sentence
+from hilbo.session.log.records import Event
+from hilbo.session.log.state import LiveSession
 
 __all__ = ["SessionLines", "line_of"]
 
@@ -24,13 +25,13 @@ class SessionLines:
     """Called with the state before an event of the log, the event, and the state after it: writes a line on stderr for
     some of them (`line_of`), from a daemon thread. Never raises, and never waits for the terminal."""
 
-    def __init__(self, study: Path, logs: Path, write: Callable[[str], Any] | None = None) -> None:
+    def __init__(self, study: Path, logs: Path, write: Callable[[str], None] | None = None) -> None:
         self._write = write or (lambda line: print(line, file=sys.stderr, flush=True))
         self._export = f"hilbo export {logs} --study {study} --out tables"
-        self._events: SimpleQueue[tuple[Any, Any, Any]] = SimpleQueue()
+        self._events: SimpleQueue[tuple[LiveSession, Event, LiveSession]] = SimpleQueue()
         threading.Thread(target=self._work, name="session lines", daemon=True).start()
 
-    def __call__(self, before: Any, event: Any, after: Any) -> None:
+    def __call__(self, before: LiveSession, event: Event, after: LiveSession) -> None:
         self._events.put((before, event, after))
 
     def _work(self) -> None:
@@ -42,11 +43,11 @@ class SessionLines:
                     self._write(f"{datetime.fromtimestamp(event.time):%H:%M:%S}      {words}")
 
 
-def line_of(before: Any, event: Any, after: Any, export: str) -> str:
+def line_of(before: LiveSession, event: Event, after: LiveSession, export: str) -> str:
     """Sentence on an event: each new condition of the device, program or preparer, the first presentation, each quarter
     of the responses, a break, and the end of the trials; "" for other events. It names no parameter.
 
-    `before`, `after`: `LiveSession`; `export`: the command that makes tables of the logs.
+    `export`: the command that makes tables of the logs.
     """
     if after.screen == "done" and before.screen != "done":
         return f"All trials have a response. Ctrl-C ends the server; then {export}"
@@ -61,7 +62,7 @@ def line_of(before: Any, event: Any, after: Any, export: str) -> str:
     return ""
 
 
-def _responses(state: Any) -> tuple[int, int]:
+def _responses(state: LiveSession) -> tuple[int, int]:
     """Responses so far, and those of the whole session, warm-ups included."""
     blocks = range(len(state.header.blocks))
     return sum(len(state.counted(i)) for i in blocks), sum(state.quota(i) for i in blocks)
