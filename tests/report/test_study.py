@@ -1,7 +1,6 @@
 """`hilbo report`: what it says of poor data and of the hypotheses, its tables, its figures and its page."""
 
 import json
-import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +13,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 from commands import run
-from studies import paper_counts, plain
+from studies import PLAIN, paper_counts, plain
 
 from hilbo import Study, Trials
 from hilbo.population.maps import RuleMap
@@ -36,7 +35,7 @@ from hilbo.study.estimate.bootstrap import can_resample
 from hilbo.study.estimate.optimum import predict_people
 from hilbo.study.file.reserved_names import is_reserved
 from hilbo.study.folder import Reference
-from hilbo.study.results.arviz_groups import groups, inference_data, predictive_shares, write_groups
+from hilbo.study.results.arviz_groups import groups, predictive_shares, write_groups
 from hilbo.study.template import NewStudy, study_text
 
 
@@ -227,22 +226,44 @@ def test_groups_are_what_arviz_reads(tmp_path):
     tree.close()
 
 
-@pytest.mark.deep  # ArviZ's figures take seconds
-@pytest.mark.parametrize("plot", ["plot_ppc", "plot_loo_pit", "plot_separation", "plot_bpv", "summary", "plot_khat"])
-def test_arviz_draws_unequal_numbers_of_answers(plot):
-    study, cohort = plain(), crowd([HILL[:6], HILL[:4], HILL[:1]])
-    data = inference_data(study, cohort, fit_cohort(study, cohort), draws=100)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of few answers and of matplotlib
-        if plot == "plot_ppc":
-            (axes,) = np.ravel(az.plot_ppc(data, kind="cumulative", show=False))
-            assert min(np.min(line.get_xdata()) for line in axes.lines if len(line.get_xdata())) >= 0
-        elif plot == "plot_khat":
-            az.plot_khat(az.loo(data, pointwise=True))
-        elif plot == "summary":
-            assert len(az.summary(data)) == 11
-        else:
-            getattr(az, plot)(data, y="response") if plot != "plot_bpv" else az.plot_bpv(data)
+UNEQUAL = [[*HILL, *HILL, *HILL[:7]], [*HILL[::-1], *HILL, *HILL[2:]], HILL[1:8]]  # 25, 25, 7
+
+
+@pytest.fixture(scope="module")
+def read_back(tmp_path_factory):
+    """inference.nc of three participants with 25, 25 and 7 responses, by two methods, as ArviZ reads the files."""
+    cohort, read = crowd(UNEQUAL), []
+    for noise in (0.5, 0.8):
+        study = Study.from_dict(PLAIN | {"gp": PLAIN["gp"] | {"noise": noise}})
+        path = tmp_path_factory.mktemp("arviz") / "inference.nc"
+        write_groups(groups(study, cohort, fit_cohort(study, cohort), draws=100), path)
+        read.append(az.from_netcdf(path, engine="h5netcdf"))
+    return read
+
+
+@pytest.mark.filterwarnings("ignore")  # of few responses
+def test_arviz_summarises_and_compares_unequal_numbers_of_answers(read_back):
+    one, other = read_back
+    observed = one.observed_data["response"].values
+    shares = [np.mean(observed == k) for k in range(3)]
+    assert observed.size == 57 and sum(shares) == pytest.approx(1.0, abs=1e-12) and min(shares) > 0
+    assert len(az.summary(one)) == 57
+    loo = az.loo(one)
+    assert np.isfinite(getattr(loo, "elpd", None) or loo.elpd_loo)
+    assert set(az.compare({"noise 0.5": one, "noise 0.8": other}).index) == {"noise 0.5", "noise 0.8"}
+
+
+@pytest.mark.filterwarnings("ignore")  # of few answers and of matplotlib
+@pytest.mark.parametrize("plot", ["plot_ppc", "plot_loo_pit", "plot_separation", "plot_bpv", "plot_khat"])
+def test_arviz_draws_unequal_numbers_of_answers(plot, read_back):
+    data = read_back[0]
+    if plot == "plot_ppc":
+        (axes,) = np.ravel(az.plot_ppc(data, kind="cumulative", show=False))
+        assert min(np.min(line.get_xdata()) for line in axes.lines if len(line.get_xdata())) >= 0
+    elif plot == "plot_khat":
+        az.plot_khat(az.loo(data, pointwise=True))
+    else:
+        getattr(az, plot)(data, y="response") if plot != "plot_bpv" else az.plot_bpv(data)
 
 
 def test_answers_are_found_in_the_table_by_trial_and_session(tmp_path):
