@@ -86,7 +86,7 @@ def _prior(analysis):
     """Sentence with the response probabilities that the model predicts without data."""
     gp = analysis.study.gp
     chances = np.asarray(gp.likelihood.class_probabilities(np.zeros(()), np.asarray(gp.kernel.variance)))
-    shares = ", ".join(f"{label} {percent(p)}" for label, p in zip(analysis.study.responses, chances, strict=True))
+    shares = ", ".join(f'"{label}" {percent(p)}' for label, p in zip(analysis.study.responses, chances, strict=True))
     return f"Before any answer the model predicts {shares}, everywhere."
 
 
