@@ -29,7 +29,18 @@ class Session(NamedTuple):
 def started(folder: Path, *more: str, seconds: float = 0.05) -> Iterator[tuple[subprocess.Popen, dict[str, str], Path]]:
     """A session of short steps without consent, ended at the end: its process, unused links, the file of its words."""
     study = fast_study(DATA, folder / "study.toml", seconds, 2)
-    given = ("--participant", "P01", "--logs", str(folder / "logs"), "--port", "0", "--gap", "0", "--dry-run", "--json")
+    given = (
+        "--participant",
+        "P01",
+        "--logs",
+        str(folder / "logs"),
+        "--port",
+        "0",
+        "--pause",
+        "0",
+        "--dry-run",
+        "--json",
+    )
     with open(folder / "words", "w", encoding="utf-8") as words:
         process = subprocess.Popen(
             [*HILBO, "session", str(study), *given, *more], stdout=subprocess.PIPE, stderr=words, text=True

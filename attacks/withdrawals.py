@@ -74,7 +74,7 @@ def _commands(quick: bool) -> list[list[str]]:
         f"export judges {given} after-judged",
         "plan study.toml --names Q01,Q02 --out after-plan.json",
         "plan study.toml --names J09 --kind aggregate-best --from after-map/result.json --out after-best.json",
-        "plan study.toml --names V1 --kind validation --from after-map/result.json --trials logs --out after-v.json",
+        "plan study.toml --names V1 --kind validation --from after-map/result.json --table logs --out after-v.json",
         "plan study.toml --reissue P03=P99 --out plan.json" if Path("plan.json").read_text().count('"P03"') else "",
     ]
     if not quick:

@@ -37,7 +37,7 @@ PAPER = ROOT / "hilbo" / "data" / "paper.toml"
 
 def one_session(file: Path, study: Study, folder: Path, number: int) -> tuple[list[dict], float, int]:
     """Delays of a whole session (s), the time from its start to the first Begin, and fits that somebody waited for."""
-    arguments = [str(file), "--participant", f"P{number:02d}", "--logs", str(folder), "--port", "0", "--gap", "0"]
+    arguments = [str(file), "--participant", f"P{number:02d}", "--logs", str(folder), "--port", "0", "--pause", "0"]
     decide, begun = Decider(study, preset_of("paper"), number), time.perf_counter()
     with server(*arguments, "--seed", str(number), "--dry-run", "--sim", "finger=none") as (_, links):
         person, watch = Client(links["participant"]), Client(links["experimenter"])

@@ -76,7 +76,7 @@ class Presenting:
 
 def one_session(file: Path, folder: Path, number: int) -> tuple[list[float], int]:
     """s from each answer's acknowledgement to the next parameters, of trials that are chosen; fits waited for."""
-    arguments = [str(file), "--participant", f"P{number:03d}", "--logs", str(folder), "--port", "0", "--gap", "0"]
+    arguments = [str(file), "--participant", f"P{number:03d}", "--logs", str(folder), "--port", "0", "--pause", "0"]
     delays = []
     with server(*arguments, "--seed", str(number), "--dry-run") as (_, links):
         person, watch, program = (

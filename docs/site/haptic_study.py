@@ -251,7 +251,7 @@ def validation_steps(size: Size, lab: Lab) -> list[Step]:
 
 New participants compare its best, mid and worst sets.""",
             f"hilbo plan haptic.toml --kind validation --names {names('N', size.newcomers)} --material foam"
-            f" {results['foam']} --trials logs --session validation --out validation.json",
+            f" {results['foam']} --table logs --session validation --out validation.json",
         ),
         Step("Sessions, and balance of the plan:", instead=partial(sessions, lab, "validation.json")),
         Step(
@@ -260,7 +260,7 @@ New participants compare its best, mid and worst sets.""",
 Each participant with a map of a silicone compares best, mid and worst sets of that map. Where a map has no minimum
 with a small enough standard deviation, the plan uses a set of second choice and names the participant.""",
             f"hilbo plan haptic.toml --kind validation --source individual --material medium --material stiff"
-            f" {results['medium']} {results['stiff']} --trials logs --session own --out own.json",
+            f" {results['medium']} {results['stiff']} --table logs --session own --out own.json",
         ),
         Step("", instead=partial(sessions, lab, "own.json")),
         Step(
@@ -269,7 +269,7 @@ with a small enough standard deviation, the plan uses a set of second choice and
 New participants compare the population's best set with each individual best set, for all three materials in one
 session: one warm-up, a rest of 10 min between materials, foam pairs twice and silicone pairs three times.""",
             f"hilbo plan haptic.toml --kind aggregate-best --names {names('A', size.judges)}"
-            f" {' '.join(results.values())} --trials logs --session best --out best.json",
+            f" {' '.join(results.values())} --table logs --session best --out best.json",
         ),
         Step("", instead=partial(sessions, lab, "best.json")),
     ]

@@ -10,7 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hilbo.cli.terminal.console import Force, Json, Out, Say, finish, progress, remark, results, seed_option, start
+from hilbo.cli.terminal.console import (
+    Force,
+    Json,
+    Names,
+    OneMaterial,
+    Out,
+    Say,
+    finish,
+    progress,
+    remark,
+    results,
+    seed_option,
+    start,
+)
 from hilbo.errors import InputError, warn_caller
 from hilbo.population.rules.registry import GIVEN, RECIPES
 from hilbo.report.figures.painter import begin_painter
@@ -40,10 +53,10 @@ Table = Annotated[
 def aggregate(
     trials: Table,
     study: StudyOption,
-    out: Out,
+    out: Out = Path("results"),
     seed: Annotated[int, seed_option("of the candidate points of the optimum")] = 0,
-    material: Annotated[str | None, typer.Option(help="Material of the table.")] = None,
-    participants: Annotated[str | None, typer.Option(help="Use only these participants, separated by commas.")] = None,
+    material: OneMaterial = None,
+    names: Names = None,
     first: Annotated[int | None, typer.Option(min=1, help="Use only the first N trials of each participant.")] = None,
     individuals: Annotated[
         bool, typer.Option(help="Also compute each participant's own optimum (the slowest step).")
@@ -62,8 +75,8 @@ def aggregate(
             help="Also compare all methods by cross-validation; writes comparison.json, comparison.csv, figures.",
         ),
     ] = False,
-    devices: Annotated[
-        int | None, typer.Option(min=1, help="Number of CPU devices to distribute participants over.")
+    cores: Annotated[
+        int | None, typer.Option(min=1, help="Number of CPU cores to distribute participants over.")
     ] = None,
     distributed: Annotated[
         bool,
@@ -87,7 +100,7 @@ def aggregate(
     """
     if not distributed:
         begin_painter()
-    start(devices)
+    start(cores)
     import jax
 
     from hilbo.study.estimate.distributed import crew, digest
@@ -99,7 +112,7 @@ def aggregate(
         with team.agreement() as agree:
             folder = held.enter_context(results(out, force)) if team.writes else None
             chosen, cohort, flagged = read_cohort(trials, study, material, say)
-            cohort = _chosen(cohort, participants) if participants else cohort
+            cohort = _chosen(cohort, names) if names else cohort
             cohort, left_out = _included(chosen, cohort, say)  # by the study's model, for any --rule
             left_out = [*flagged, *left_out]
             chosen = chosen if rule is None else by_rule(chosen, rule)
@@ -119,12 +132,12 @@ def aggregate(
 def robustness(
     trials: Table,
     study: StudyOption,
-    out: Out,
+    out: Out = Path("robustness"),
     seed: Annotated[int, seed_option("of the candidate points of the optima")] = 0,
     learn: Annotated[
         str, typer.Option(help="Hyperparameters to optimise, separated by commas; learnt-1 to learnt-3 optimise all.")
     ] = "theta,noise,thresholds",
-    material: Annotated[str | None, typer.Option(help="Material of the table.")] = None,
+    material: OneMaterial = None,
     pilot: Annotated[
         bool,
         typer.Option("--pilot", help="Print the optimised hyperparameters as [gp], with 95 % intervals, for a study."),

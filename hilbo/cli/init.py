@@ -2,7 +2,7 @@
 
 hilbo init study.toml --parameter hue=140:260:deg --parameter light=20:80:%
 hilbo init study.toml --parameter a=0:2:mm --parameter b=0:2:mm --constraint "a + 2*b <= 3"
-hilbo init study.toml --device
+hilbo init study.toml --by device
 """
 
 import sys
@@ -11,8 +11,8 @@ from typing import Annotated
 
 import typer
 
+from hilbo.cli.terminal.console import check_choice
 from hilbo.cli.terminal.new_file import check_free, write_new
-from hilbo.errors import InputError
 
 __all__ = ["init"]
 
@@ -36,10 +36,10 @@ def init(
     responses: Annotated[str, typer.Option(help="Response categories, lowest first.")] = "different,similar,close",
     goal: Annotated[str, typer.Option(help="The response to maximise; by default the highest.")] = "",
     trials: Annotated[int, typer.Option(min=1, help="Number of trials per participant.")] = 25,
-    device: Annotated[
-        bool, typer.Option("--device", help="Use the hilbo haptic device instead of your own stimulus program.")
-    ] = False,
-    by: Annotated[str, typer.Option(help="Without --device: who presents, program or person.")] = "program",
+    by: Annotated[
+        str,
+        typer.Option(help="Who presents: your own program, a person, or the haptic device (program, person, device)."),
+    ] = "program",
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
     """Write a commented study file with the name, parameters and answers given."""
@@ -47,12 +47,11 @@ def init(
     from hilbo.study.template import NewStudy, parameter_of, study_text
 
     parameters = tuple(parameter_of(text) for text in parameter or [])
-    if by not in ("program", "person"):
-        raise InputError(f'--by is "{by}"; it must be program or person.')
-    if device and by == "person":
-        raise InputError("--by person and --device exclude each other; leave one of them out.")
+    check_choice("by", by, ("program", "person", "device"))
     answers = tuple(text.strip() for text in responses.split(","))
-    new = NewStudy(name or study.stem, parameters, answers, trials, device, by, goal.strip(), tuple(constraint or ()))
+    device, presenter = by == "device", "person" if by == "person" else "program"
+    limits = tuple(constraint or ())
+    new = NewStudy(name or study.stem, parameters, answers, trials, device, presenter, goal.strip(), limits)
     text = study_text(new)
     write_new(study, text, force)
     print(f"{study}: written; read it, then hilbo doctor {study}", file=sys.stderr)

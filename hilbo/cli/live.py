@@ -17,7 +17,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from hilbo.cli.device.options import Baud, Sim, Where, sim_options, takes
-from hilbo.cli.terminal.console import JsonToo, check_choice, progress, seed_option, start
+from hilbo.cli.terminal.console import JsonToo, OneMaterial, check_choice, progress, seed_option, start
 from hilbo.errors import InputError
 
 __all__ = ["doctor", "live", "need_extra", "session"]
@@ -52,7 +52,7 @@ class Served(NamedTuple):
         _PORT
     )
     lan: Annotated[bool, typer.Option("--lan", help="Reachable from the network, by one-time links.")] = False
-    gap: Annotated[float, typer.Option("--gap", min=0.0, help="Pause between two trials, s.")] = 0.7
+    pause: Annotated[float, typer.Option("--pause", min=0.0, help="Pause between two trials, s.")] = 0.7
     browse: Annotated[bool, typer.Option("--open", help="Open the experimenter's page in this computer's browser.")] = (
         False
     )
@@ -68,7 +68,7 @@ def session(
         str | None, typer.Option("--session", help="Label of the session; by default 1, or the plan's.")
     ] = None,
     plan: Annotated[Path | None, typer.Option(help="Plan of the study, from `hilbo plan`.")] = None,
-    material: Annotated[str | None, typer.Option(help="Material of the study.")] = None,
+    material: OneMaterial = None,
     resume: Annotated[bool, typer.Option("--resume", help="Resume an interrupted session.")] = False,
     people: Annotated[Path | None, typer.Option(help="participants.csv; by default the one among the logs.")] = None,
     warm_start: Annotated[
@@ -111,7 +111,7 @@ def session(
         place.gate.keep_in(keys_path(log.path))
         if hub.state.study.stimulus is not None and line.device != "sim":
             raise InputError(f"{study}: a program or a person presents, and no device is used; leave --device out.")
-        hub.gap = served.gap
+        hub.gap = served.pause
         _say_changes(study, hub.state.study)
         hub.observe = SessionLines(study, served.logs)
         _serve(hub, place, served, as_json)

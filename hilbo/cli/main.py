@@ -5,6 +5,7 @@ folder, machine-readable ones with `--json` to stdout, progress to stderr (`cons
 bad usage or bad input, in one sentence.
 """
 
+import sys
 import warnings
 from typing import Annotated
 
@@ -24,6 +25,7 @@ from hilbo.cli.imports import imports
 from hilbo.cli.init import init
 from hilbo.cli.simulate import simulate
 from hilbo.cli.terminal.console import fail, say_remarks
+from hilbo.cli.terminal.renamed import check_renamed
 from hilbo.errors import InputError
 
 __all__ = ["app", "main"]
@@ -61,6 +63,7 @@ def main() -> None:
     2 for bad input, 1 for any other failure; remarks on the input are printed as sentences too."""
     warnings.showwarning = say_remarks(warnings.showwarning)
     try:
+        check_renamed(sys.argv[1:])
         app()
     except InputError as error:
         fail(str(error), 2)

@@ -18,14 +18,14 @@ Memory = Annotated[str, typer.Option(help='"short" (N samples) or "full".')]
 
 def identify(
     table: Annotated[Path, typer.Argument(help="Creep and relaxation tests (CSV, text, Parquet).", show_default=False)],
-    out: Out,
+    out: Out = Path("material"),
     material: Annotated[
         str | None, typer.Option(help="Which of the table's materials, or its name if the table has no column for it.")
     ] = None,
     taps: Taps = 101,
     period: Period = 1e-3,
     memory: Memory = "short",
-    damping: Annotated[float | None, typer.Option(help="Damping of your device, N.s/m.")] = None,
+    damping: Annotated[float | None, typer.Option(help="Damping of the device, N.s/m.")] = None,
     only: Annotated[str | None, typer.Option(help="Fit one kind of test alone: relaxation or creep.")] = None,
     begin: Annotated[str, typer.Option(help='Tests begin at "rest" or in "equilibrium" with the first row.')] = "rest",
     lag: Annotated[str, typer.Option(help='Lag of the force against the position, ms; or "fit".')] = "fit",
@@ -35,7 +35,7 @@ def identify(
             help='Corner of the force\'s filter, Hz; "fit", "none", or "auto" (fit with a fitted lag where it shows).'
         ),
     ] = "auto",
-    compare: Annotated[bool, typer.Option(help="Refit with other numbers of past samples.")] = True,
+    compare_memory: Annotated[bool, typer.Option(help="Refit with other numbers of past samples.")] = True,
     model: Annotated[str, typer.Option(help='For moduli: "fosls" or "fractional-maxwell".')] = "fosls",
     weights: Annotated[str | None, typer.Option(help='For moduli: residuals over the "range", or "relative".')] = None,
     longest: Annotated[float | None, typer.Option(help="Use only the first seconds of each test, s.")] = None,
@@ -86,7 +86,7 @@ def identify(
         measurements = read_material(table, material, begin=begin, only=only, longest=longest, layout=layout)
         measured = measurements.tests[0].kind in MEASURED
         chosen = _model(measured, model, weights, taps, period, memory, instrument)
-        choices = memory_selection.CHOICES if measured and compare else ()
+        choices = memory_selection.CHOICES if measured and compare_memory else ()
         try:
             result = characterise.characterise(
                 measurements.tests, chosen, seed, choices, say, find_filter=instrument["corner"] == "auto"
@@ -134,7 +134,7 @@ def passivity(
     alpha: Annotated[float | None, typer.Option("--alpha", help="Order.", show_default=False)] = None,
     K0: Annotated[float | None, typer.Option("--K0", help="N/mm; by default from --K-eff.")] = None,
     K_eff: Annotated[float | None, typer.Option("--K-eff", help="Effective stiffness H(1), N/mm.")] = None,
-    damping: Annotated[float | None, typer.Option(help="Damping b of the device, N.s/m.")] = None,
+    damping: Annotated[float | None, typer.Option(help="Damping of the device, N.s/m.")] = None,
     delay: Annotated[
         float | None, typer.Option(help="Delay from the sample of the position to the output of its force, s.")
     ] = None,

@@ -25,12 +25,14 @@ def plan(
             min=1, help="Number of participants: P01, P02, ...; default: [plan] people, or all in the results."
         ),
     ] = None,
-    names: Annotated[str | None, typer.Option(help="Ids of the participants instead, separated by commas.")] = None,
+    names: Annotated[str | None, typer.Option(help="Ids of the participants, separated by commas.")] = None,
     kind: Annotated[str, typer.Option(help="optimisation, validation or aggregate-best.")] = "optimisation",
     results_: Annotated[
         list[str] | None, typer.Option("--from", help="result.json of the optimisation; MATERIAL=PATH for several.")
     ] = None,
-    trials: Annotated[Path | None, typer.Option(help="For a validation: trial table or logs of the results.")] = None,
+    table: Annotated[
+        Path | None, typer.Option(help="For a validation: trial table, or folder of logs, of which the results are.")
+    ] = None,
     material: Annotated[list[str] | None, typer.Option(help="Use only this material. Repeatable.")] = None,
     source: Annotated[str, typer.Option(help="For a validation: aggregate or individual.")] = "aggregate",
     session: Annotated[str, typer.Option(help="Label of the session in tables and names of logs.")] = "",
@@ -74,7 +76,7 @@ def plan(
     everybody = own and (participants, names) == (None, None)
     people = [] if everybody else _people(participants, names, "P" if kind == "optimisation" or own else "V")
     check_free(out, force)
-    content = _plan_of(study, kind, source, people, materials, paths, trials, session, seed)
+    content = _plan_of(study, kind, source, people, materials, paths, table, session, seed)
     check_free(out, force)  # it may have been made in the meantime
     _write_plan(content, out, force, as_json)
     if register is not None:
@@ -169,7 +171,7 @@ def _results_of(study, paths: dict[str, Path]) -> dict[str, Any]:
 
 def _sets(study, kind, by_material, trials, source, people, say) -> dict[str, Any]:
     """Material ("" without) -> name -> parameters of the sets that validations compare, from the results `by_material`
-    (material -> result). Raises `InputError` if they do not fit the study or the participants, or --trials is
+    (material -> result). Raises `InputError` if they do not fit the study or the participants, or --table is
     missing."""
     from hilbo.session.export.tables import read_log_trials
     from hilbo.session.plan import validation_sets
@@ -178,7 +180,7 @@ def _sets(study, kind, by_material, trials, source, people, say) -> dict[str, An
     if kind != "aggregate-best":
         validation_sets.check_participants(by_material.values(), people, source)
         if trials is None:
-            raise InputError("plan: a validation reads the map itself; give --trials, the answers it was made from.")
+            raise InputError("plan: a validation reads the map itself; give --table, the responses it was made from.")
     sets = {}
     for material, result in by_material.items():
         here = study.material(material) if material else study

@@ -22,7 +22,7 @@ app_participants = typer.Typer(
 def export(
     logs: Annotated[Path, typer.Argument(help="Folder of session logs.", show_default=False)],
     study: Annotated[Path, typer.Option("--study", help="Study file (TOML).")],
-    out: Annotated[Path, typer.Option("--out", help="Folder for the tables.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the tables.")] = Path("tables"),
     plan: Annotated[
         list[Path] | None,
         typer.Option("--plan", help="Also export this plan, so that the report lists deviations from it. Repeatable."),

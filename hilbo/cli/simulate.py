@@ -32,9 +32,9 @@ _PEOPLE = 24
 
 
 def simulate(
-    out: Out,
+    out: Out = Path("simulated"),
     preset: Preset = None,
-    study: Annotated[Path | None, typer.Option("--study", help="Study file; by default the paper's.")] = None,
+    study: Annotated[Path | None, typer.Option("--study", help="Study file (TOML); by default the paper's.")] = None,
     participants: Annotated[int | None, typer.Option(min=1, help="Number of participants; by default 24.")] = None,
     seed: Annotated[
         int, seed_option("of the participants, of their responses and of the candidate points of the optima")
@@ -48,16 +48,20 @@ def simulate(
         str | None,
         typer.Option(help="With --live: optimisation, validation or aggregate-best; by default optimisation."),
     ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.05, help="With --live: duration of every step.")] = None,
+    step_seconds: Annotated[
+        float | None, typer.Option(min=0.05, help="With --live: duration of every step, s; by default the study's.")
+    ] = None,
 ) -> None:
     """Simulate a study of known truth and aggregate it; with --live, run one session with a simulated participant.
 
     Writes the simulated trials and their results, of each material to a folder of its name, or the session's log and
     screenshots, to the folder --out.
     """
-    _check_mode(live, {"--participants": participants, "--force": force}, {"--kind": kind, "--seconds": seconds})
+    _check_mode(
+        live, {"--participants": participants, "--force": force}, {"--kind": kind, "--step-seconds": step_seconds}
+    )
     if live:
-        _simulate_live(preset, study, out, kind or "optimisation", seconds, seed, as_json)
+        _simulate_live(preset, study, out, kind or "optimisation", step_seconds, seed, as_json)
         return
     with results(out, force) as folder, progress() as say:
         contents = _simulate(preset, study, participants or _PEOPLE, seed, folder, say)

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hilbo.cli.terminal.console import Force, Json, Out, Preset, finish, progress, results, seed_option, start
+from hilbo.cli.terminal.console import (
+    Force,
+    Json,
+    OneMaterial,
+    Out,
+    Preset,
+    finish,
+    progress,
+    results,
+    seed_option,
+    start,
+)
 from hilbo.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +34,7 @@ StudyFile = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
 def validate(
     responses: Annotated[Path, typer.Argument(help="Validation table (CSV or Parquet).", show_default=False)],
     study: StudyFile,
-    out: Out,
+    out: Out = Path("validation"),
     sets: Annotated[Path | None, typer.Option(help="Sets table: parameters and source of each set.")] = None,
     material: Annotated[str | None, typer.Option(help="Use only this material of the table.")] = None,
     seed: Annotated[int, seed_option("of bootstrap resamples")] = 0,
@@ -45,13 +56,15 @@ def validate(
 
 def power(
     study: Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)],
-    out: Out,
+    out: Out = Path("power"),
     preset: Preset = None,
     rule: Annotated[str | None, typer.Option(help="Aggregation method in place of the study file's.")] = None,
-    material: Annotated[str | None, typer.Option(help="Material of the study.")] = None,
-    participants: Annotated[str, typer.Option(help="Numbers of participants, separated by commas.")] = "6,12,24",
+    material: OneMaterial = None,
+    participants: Annotated[
+        str, typer.Option(help="Number of participants; several numbers separated by commas.")
+    ] = "6,12,24",
     trials: Annotated[
-        str, typer.Option(help="Numbers of trials per participant, separated by commas.")
+        str, typer.Option(help="Number of trials per participant; several numbers separated by commas.")
     ] = "10,15,20,25",
     error: Annotated[
         float, typer.Option(min=0, max=1, help="Target error of the optimum (NRMSE, fraction of the ranges).")
@@ -119,7 +132,7 @@ def _numbers(text: str, option: str) -> tuple[int, ...]:
 
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder with study.toml and trials.csv.", show_default=False)],
-    out: Out,
+    out: Out = Path("report"),
     exclude: Annotated[
         str | None, typer.Option(help='Rule for excluding participants, instead of the study\'s: "trials < 10".')
     ] = None,

@@ -31,7 +31,7 @@ def tried(
         Path | None,
         typer.Argument(help="Study file of K1, B1 and alpha that a program presents; by default hilbo's own."),
     ] = None,
-    trials: Annotated[int | None, typer.Option(min=15, max=25, help=f"How many blocks; {_TRIALS} by default.")] = None,
+    trials: Annotated[int | None, typer.Option(min=15, max=25, help=f"Number of trials; {_TRIALS} by default.")] = None,
     seed: Annotated[
         int | None, seed_option("of the hidden reference and of the first blocks; random by default")
     ] = None,

@@ -139,7 +139,7 @@ def _parameters(new: NewStudy) -> Sequence[Parameter]:
     parameters, if there are none, or if a name is repeated."""
     if new.device:
         if new.parameters:
-            raise InputError("--parameter: the device renders K1, B1 and alpha; leave it out, or --device.")
+            raise InputError("--parameter: the device renders K1, B1 and alpha; leave it out, or --by device.")
         return _DEVICE
     if not new.parameters:
         raise InputError(f"--parameter: a study needs at least one; write {_FORM}, for example hue=140:260:deg.")

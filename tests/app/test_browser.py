@@ -26,7 +26,7 @@ pytestmark = [
 def test_a_whole_session_by_one_command(tmp_path, kind, trials):
     (tmp_path / "base.toml").write_text(DATA.read_text(encoding="utf-8").replace("trials = 25", "trials = 9"))
     command = [*rehearsal.HILBO, "simulate", "--live", "--study", str(tmp_path / "base.toml"), "--kind", kind]
-    command += ["--out", str(tmp_path / "out"), "--seconds", "0.3", "--json"]
+    command += ["--out", str(tmp_path / "out"), "--step-seconds", "0.3", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
@@ -48,7 +48,7 @@ def test_a_whole_session_of_levels_without_a_device_by_one_command(tmp_path, by)
     named = ("texture=silk,wood,stone", "grains=0:6::integer", "gain=0.5:20:N")
     (tmp_path / "base.toml").write_text(study_text(NewStudy("s", tuple(map(parameter_of, named)), trials=9, by=by)))
     command = [*rehearsal.HILBO, "simulate", "--live", "--study", str(tmp_path / "base.toml")]
-    command += ["--out", str(tmp_path / "out"), "--seconds", "0.3", "--json"]
+    command += ["--out", str(tmp_path / "out"), "--step-seconds", "0.3", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)

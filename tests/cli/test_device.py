@@ -68,7 +68,7 @@ def test_set(device, sets):
     code, stdout, _ = device("set", *A, "--json", *FAST)
     in_force = json.loads(stdout)
     assert (code, in_force["K1"], in_force["memory"]) == (0, float(np.float32(5.58)), "short")
-    code, stdout, _ = device("set", "--sets", sets, "--name", "S", *FAST)
+    code, stdout, _ = device("set", "--sets", sets, "--set", "S", *FAST)
     assert code == 0 and "K1 = 5.7 N/mm" in stdout
     code, stdout, _ = device("set", *A[2:], "--study", STUDY, "--json", *FAST)  # K0 from the study's K_eff
     assert json.loads(stdout)["needs"] == pytest.approx(0.75981, abs=1e-5)
@@ -85,8 +85,8 @@ def test_set(device, sets):
         (["set", *A, "--memory", "long"], 2, 'memory is "long"'),
         (["set", *A, "--damping", "2"], 2, "assumes 2 N.s/m of damping and the device has 0.95"),
         (["set", *A, "--device", "/dev/hilbo-nothing"], 2, "there is no such port"),
-        (["set", "--sets", "sets.csv"], 2, "contains the sets S, A, V; choose one with --name"),
-        (["set", "--sets", "sets.csv", "--name", "X"], 2, 'contains no set "X"'),
+        (["set", "--sets", "sets.csv"], 2, "contains the sets S, A, V; choose one with --set"),
+        (["set", "--sets", "sets.csv", "--set", "X"], 2, 'contains no set "X"'),
         (["set", "--sets", "none.csv"], 2, "none.csv: cannot be read"),
         (["start"], 1, "The device has no active set; send one first."),
         (["stop"], 2, "--device is missing"),

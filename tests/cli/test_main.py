@@ -39,9 +39,7 @@ def test_help_answers_without_jax():
 @pytest.mark.deep  # compiles what test_results and `make demo` compile
 def test_aggregate_writes_everything(capsys, monkeypatch, tmp_path):
     out = tmp_path / "results"
-    code, stdout, _ = run(
-        capsys, monkeypatch, "aggregate", *VIDEO, "--out", out, "--participants", "V01,V02,V03", "--json"
-    )
+    code, stdout, _ = run(capsys, monkeypatch, "aggregate", *VIDEO, "--out", out, "--names", "V01,V02,V03", "--json")
     assert code == 0
     content = json.loads(stdout)
     assert content == json.loads((out / "result.json").read_text())
@@ -146,7 +144,7 @@ def test_unknown_rules_are_refused(capsys, monkeypatch, tmp_path):
         (["--live", "--force"], "--force does nothing with --live"),
         (["--live", "--participants", "3"], "--participants does nothing with --live"),
         (["--kind", "validation"], "--kind does nothing without --live"),
-        (["--seconds", "0.1"], "--seconds does nothing without --live"),
+        (["--step-seconds", "0.1"], "--step-seconds does nothing without --live"),
     ],
 )
 def test_options_of_the_other_kind_of_simulation_are_refused(capsys, monkeypatch, tmp_path, options, words):
@@ -198,7 +196,7 @@ def test_simulate_keeps_what_it_simulated(capsys, monkeypatch, tmp_path):
 def test_no_optima_of_people_are_sought_if_they_are_not_wanted(capsys, monkeypatch, tmp_path):
     """The results above 1,000 participants, too, which have the same optimum, and nothing by other rules or after fewer
     trials."""
-    few = ["--participants", "V01,V02,V03", "--json"]
+    few = ["--names", "V01,V02,V03", "--json"]
     out = tmp_path / "large"
     code, stdout, stderr = run(capsys, monkeypatch, "aggregate", *VIDEO, "--out", out, "--no-individuals", *few)
     assert code == 0 and "optima after fewer trials" not in stderr

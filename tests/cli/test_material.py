@@ -127,7 +127,7 @@ def test_a_force_that_rises_while_held_is_refused_with_file_and_cause(capsys, mo
 def test_identify_reads_an_instruments_table_by_the_options_that_its_refusals_name(capsys, monkeypatch, tmp_path):
     path, out = tmp_path / "foam.txt", tmp_path / "out"
     path.write_bytes(CASES["RheoCompass, intervals"].data)
-    arguments = ["identify", path, "--out", out, "--no-compare", "--lag", 0]
+    arguments = ["identify", path, "--out", out, "--no-compare-memory", "--lag", 0]
     for words, options in (
         ("choose one by --block 1", ["--block", 2, "--block", 3]),
         ("give its area in mm2 by --area and its thickness in mm by --gap", ["--area", AREA, "--gap", GAP]),
@@ -139,7 +139,7 @@ def test_identify_reads_an_instruments_table_by_the_options_that_its_refusals_na
     code, _, stderr = run(capsys, monkeypatch, *arguments)
     assert code == 0 and "blocks 2 and 3 of 3 were read" in " ".join(stderr.split())
     (tmp_path / "plain.csv").write_bytes(PLAIN)
-    plain = ["identify", tmp_path / "plain.csv", "--out", tmp_path / "plain", "--no-compare", "--lag", 0]
+    plain = ["identify", tmp_path / "plain.csv", "--out", tmp_path / "plain", "--no-compare-memory", "--lag", 0]
     assert run(capsys, monkeypatch, *plain)[0] == 0
     ours, theirs = (json.loads((folder / "result.json").read_text())["set"] for folder in (out, tmp_path / "plain"))
     assert ours == pytest.approx(theirs, rel=1e-7)

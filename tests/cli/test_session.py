@@ -345,7 +345,7 @@ def test_from_logs_to_a_validation_plan(hilbo, tmp_path):
         assert code == 0, err
     assert (tmp_path / "a" / "result.json").read_bytes() == (tmp_path / "b" / "result.json").read_bytes()
     assert (tmp_path / "a" / "optima.csv").read_bytes() == (tmp_path / "b" / "optima.csv").read_bytes()
-    given = ("--kind", "validation", "--from", "a/result.json", "--trials")
+    given = ("--kind", "validation", "--from", "a/result.json", "--table")
     code, _, err = hilbo("plan", "study.toml", "--participants", 4, *given, "logs", "--out", "v.json")
     assert code == 0, err
     plan = json.loads((tmp_path / "v.json").read_text())

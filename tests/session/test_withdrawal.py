@@ -116,12 +116,12 @@ def results_of(monkeypatch, folder, people, *command):
 
 
 def test_results_with_them_go_and_those_that_may_hold_them_and_are_made_again(folder, capsys, monkeypatch):
-    results_of(monkeypatch, folder / "map", ["P01", "P02"], "aggregate", "trials.csv", "--participants", "P01,P02")
+    results_of(monkeypatch, folder / "map", ["P01", "P02"], "aggregate", "trials.csv", "--names", "P01,P02")
     results_of(monkeypatch, folder / "others", ["P01", "P03"], "aggregate", "trials.csv")
     results_of(monkeypatch, folder / "compared", [], "validate", "validation.csv", "--study", "study.toml")
     err = delete(capsys, monkeypatch, folder, "P02")
     assert not (folder / "map").exists() and (folder / "others" / "map.png").exists()
-    assert "make again: " in err and "hilbo aggregate trials.csv --participants P01\n" in err
+    assert "make again: " in err and "hilbo aggregate trials.csv --names P01\n" in err
     assert not (folder / "compared").exists() and "hilbo validate validation.csv --study study.toml\n" in err
 
 

@@ -152,7 +152,7 @@ def assert_same(one, other):
 @pytest.mark.deep
 @pytest.mark.release
 def test_two_and_four_processes_and_four_devices_give_the_map_of_one(folder):
-    process = start(folder, "one", "--devices", 1, "--individuals", "--distributed", flags="")
+    process = start(folder, "one", "--cores", 1, "--individuals", "--distributed", flags="")
     assert process.communicate(timeout=900) and process.returncode == 2  # nobody to be distributed with
     assert together(folder, "one", 1)[0][1] == 0
     expected = result(folder, "one")

@@ -56,7 +56,7 @@ class Session:
             str(folder / "logs"),
             "--port",
             str(free_port()),
-            "--gap",
+            "--pause",
             "0",
             "--dry-run",
             "--json",

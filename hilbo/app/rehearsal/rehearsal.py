@@ -171,7 +171,7 @@ def rehearse(
     here = study if material is None else study.material(material)
     population = with_truth(here, population_of(here, preset)[1], seed)
     arguments = [str(file), "--participant", "P01", "--logs", str(out / "logs"), "--port", "0"]
-    arguments += ["--dry-run", "--gap", "0.7" if seconds is None else "0.05"]
+    arguments += ["--dry-run", "--pause", "0.7" if seconds is None else "0.05"]
     if phase != "optimisation":
         made = _plan(study, material, example_sets(here, population), phase, seed)
         plan = out / "plan.json"

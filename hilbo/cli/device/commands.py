@@ -80,7 +80,7 @@ def set_(chosen: Chosen, line: Line, as_json: JsonToo = False) -> None:
     """Activate a set, read it back bit for bit, and print it. Nothing is started."""
     wanted = chosen_set(chosen, line)
     if wanted is None:
-        raise InputError("No set is given; a set has --K1, --B1 and --alpha, or --sets and --name.")
+        raise InputError("No set is given; a set has --K1, --B1 and --alpha, or --sets and --set.")
     with opened(line) as device:
         in_force = device.send(**wanted)
     print_result(in_force._asdict(), f"in force: {set_words(in_force)}", as_json)

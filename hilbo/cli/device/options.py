@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 Where = Annotated[str, typer.Option("--device", help='"sim", a serial port, or socket://host:port.')]
-Baud = Annotated[int, typer.Option(min=1, help="Line rate of a serial port.")]
+Baud = Annotated[int, typer.Option(min=1, help="Baud rate of a serial port.")]
 Sim = Annotated[
     list[str] | None, typer.Option("--sim", help="KEY=VALUE of the simulated device, such as finger=sine; repeat.")
 ]
@@ -47,9 +47,11 @@ class Line(NamedTuple):
     device: Where = "sim"
     baud: Baud = 921_600
     sim: Sim = None
-    study: Annotated[_Path, typer.Option("--study", help="Its damping must not exceed the device's.")] = None
-    damping: Annotated[_Number, typer.Option(help="Assumed damping, N.s/m; by default the study's.")] = None
-    patience: Annotated[_Number, typer.Option(min=0.001, help="Time limit of a reply, s; 0.1 on a line.")] = None
+    study: Annotated[
+        _Path, typer.Option("--study", help="Study file (TOML), whose damping must not exceed the device's.")
+    ] = None
+    damping: Annotated[_Number, typer.Option(help="Damping of the device, N.s/m; by default the study's.")] = None
+    patience: Annotated[_Number, typer.Option(min=0.001, help="Time limit of a reply, s.")] = None
     capture: Annotated[_Path, typer.Option(help="Write the bytes that the device sends to this file.")] = None
 
 
@@ -67,7 +69,7 @@ class Chosen(NamedTuple):
     states: Annotated[int | None, typer.Option(help="Exponentials of full memory (10).")] = None
     force_limit: Annotated[_Number, typer.Option(help="N; by default that of the device.")] = None
     sets: Annotated[_Path, typer.Option("--sets", help="Sets table (CSV) to take the set from.")] = None
-    name: Annotated[str | None, typer.Option("--name", help="Set of the table.")] = None
+    set_: Annotated[str | None, typer.Option("--set", help="Which set of the table (set_id).")] = None
 
 
 def takes(**groups: type) -> Callable:
@@ -147,9 +149,9 @@ def chosen_set(chosen: Chosen, line: Line) -> dict[str, Any] | None:
     given = {name: value for name in _OF_A_SET if (value := getattr(chosen, name)) is not None}
     if chosen.sets is not None:
         named_sets = sets_of(chosen.sets, line, chosen.K_eff)
-        if chosen.name is None and len(named_sets) > 1:
-            raise InputError(f"{chosen.sets}: contains the sets {', '.join(named_sets)}; choose one with --name.")
-        name = next(iter(named_sets)) if chosen.name is None else chosen.name
+        if chosen.set_ is None and len(named_sets) > 1:
+            raise InputError(f"{chosen.sets}: contains the sets {', '.join(named_sets)}; choose one with --set.")
+        name = next(iter(named_sets)) if chosen.set_ is None else chosen.set_
         if name not in named_sets:
             raise InputError(f'{chosen.sets}: contains no set "{name}"; it has {", ".join(named_sets)}.')
         return named_sets[name] | given
@@ -157,7 +159,7 @@ def chosen_set(chosen: Chosen, line: Line) -> dict[str, Any] | None:
         return None
     for name in ("K1", "B1", "alpha"):
         if name not in given:
-            raise InputError(f"--{name} is missing; a set has --K1, --B1 and --alpha, or --sets and --name.")
+            raise InputError(f"--{name} is missing; a set has --K1, --B1 and --alpha, or --sets and --set.")
     return _whole(given, line, chosen.K_eff)
 
 

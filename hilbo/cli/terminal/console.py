@@ -28,6 +28,8 @@ __all__ = [
     "ForceFile",
     "Json",
     "JsonToo",
+    "Names",
+    "OneMaterial",
     "Out",
     "Preset",
     "Say",
@@ -45,6 +47,8 @@ __all__ = [
 ]
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+Names = Annotated[str | None, typer.Option("--names", help="Ids of the participants, separated by commas.")]
+OneMaterial = Annotated[str | None, typer.Option("--material", help="Use only this material of the study.")]
 Preset = Annotated[
     str | None,
     typer.Option(
