@@ -2,7 +2,6 @@
 
 import threading
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from live import Driver
@@ -12,9 +11,13 @@ from hilbo.session.log import actions as live
 from hilbo.session.log.state import LiveSession
 
 
+def before_all(driver):
+    return LiveSession.start(driver.state.study, driver.state.header)
+
+
 def lines_of(driver):
     """All lines of a driver's events, in their order."""
-    state, lines = LiveSession.start(driver.state.study, driver.state.header), []
+    state, lines = before_all(driver), []
     for event in driver.events:
         after = state.after(event)
         lines += [line] if (line := line_of(state, event, after, "hilbo export")) else []
@@ -58,20 +61,21 @@ def test_a_terminal_that_takes_nothing_stops_nobody(fails):
 
     def write(line):
         assert free.wait(10)
-        if fails and not written:
-            written.append("failed")
-            raise OSError("Input/output error")
         written.append(line)
+        if fails and len(written) == 1:
+            raise OSError("Input/output error")
 
-    lines = SessionLines(Path("study.toml"), Path("logs"), write)
-    session = LiveSession.__new__(LiveSession)
-    done, going = SimpleNamespace(screen="done"), SimpleNamespace(screen="trial", active=None)
-    for event in (SimpleNamespace(kind="stimulus", time=0.0), SimpleNamespace(kind="broken", time=0.0)):
-        lines(going, event, session if event.kind == "broken" else going)
-    lines(going, SimpleNamespace(kind="answer", time=0.0), done)
+    driver = Driver()
+    driver.step()
+    driver.log(live.pause(driver.state, "participant", 50.0))
+    driver.log(live.abort(driver.state, "enough", 51.0))
+    lines, state = SessionLines(Path("study.toml"), Path("logs"), write), before_all(driver)
+    for event in driver.events:
+        lines(state, event, state := state.after(event))
+    assert not written
     free.set()
-    for _ in range(500):
+    for _ in range(1000):
         if len(written) == 2:
             break
         threading.Event().wait(0.01)
-    assert written[1].endswith("then hilbo export logs --study study.toml --out tables")
+    assert "A break" in written[0] and written[1].endswith("The session is ended early: enough.")
