@@ -15,6 +15,13 @@ import msgspec
 import pytest
 
 import hilbo
+from hilbo import Study
+from hilbo.search.candidates import search_points
+from hilbo.search.rendering import Rendering
+from hilbo.simulation.folder import simulate_folder
+from hilbo.study.analysis.best_mid_worst import best_mid_worst
+from hilbo.study.cohort import cohort_of
+from hilbo.study.estimate.aggregate import aggregate_cohort
 from hilbo.study.file import schema
 from hilbo.study.file.columns import UNWRITTEN
 from hilbo.study.file.protocols import PhaseTable
@@ -278,6 +285,20 @@ def check_places_of_the_papers_numbers(folder):
         files = {name for place in places for name in re.findall(r"`(\w+\.(?:csv|toml))`", place)}
         assert words and [word for word in words if word not in text] == []
         assert files and [name for name in files if not [*page.rglob(name)]] == []
+
+
+@pytest.mark.deep
+def test_the_picture_of_the_readme_is_drawn_from_the_demos_numbers(tmp_path):
+    """The simulated study of the demo, up to the sets that the picture marks."""
+    shown = json.loads(script("readme_picture").NUMBERS.read_text(encoding="utf-8"))
+    simulate_folder(tmp_path, "paper", shown["participants"], shown["seed"])
+    study = Study.load(tmp_path / "study.toml")
+    cohort = cohort_of(hilbo.read_trials(tmp_path / "trials.csv", study), study)
+    aggregate = aggregate_cohort(study, cohort, shown["seed"], alternatives=False, individuals=False)
+    points = search_points(study.space, shown["seed"])
+    sets = best_mid_worst(study, aggregate.surface, points, prior=aggregate.map.map_prior)
+    for name, x in zip(("population", "best", "mid", "worst"), [aggregate.optimum.x, *sets.x], strict=True):
+        assert Rendering.at(study.space, x).shown == pytest.approx(shown[name], rel=1e-6), name
 
 
 def test_the_data_dictionary_is_that_of_the_code():
