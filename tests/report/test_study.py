@@ -292,7 +292,8 @@ def posteriors_at(posteriors):
 
 @pytest.mark.deep
 def test_a_report_of_one_person(capsys, monkeypatch, tmp_path):
-    """By the rule that new studies have."""
+    """By the rule that new studies have, and as of more participants than `MANY`."""
+    monkeypatch.setattr("hilbo.report.results.MANY", 0)
     folder, out = tmp_path / "folder", tmp_path / "out"
     folder.mkdir()
     parameters = Parameter("u", 0.0, 1.0), Parameter("v", 0.0, 1.0)
@@ -308,7 +309,8 @@ def test_a_report_of_one_person(capsys, monkeypatch, tmp_path):
     assert "P1 is the only participant" in page and "1 participant gave 8 responses" in page
     assert "recorded for 9 trials (saturated 2, slewed 1, controlled 1); excluded by [study] exclude_flags" in page
     counts = {"recorded": 9, "flagged": {"saturated": 2, "slewed": 1, "controlled": 1}, "left_out": 1}
-    assert json.loads(stdout)["materials"][""]["flags"] == counts
+    content = json.loads(stdout)["materials"][""]
+    assert content["flags"] == counts and [p["participant"] for p in content["participants"]] == ["P1"]
 
 
 @pytest.mark.deep

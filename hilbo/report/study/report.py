@@ -148,7 +148,7 @@ def _write_material(material, analysis: Analysis, validated, folder: Path, seed)
     study, people = analysis.study, people_of(analysis.study, analysis.aggregate)
     reference = material.reference
     truth = reference.x if reference is not None and reference.name == "the truth" else None
-    content = cohort_content(analysis.population, truth, people)
+    content = cohort_content(analysis.population, truth, people) | {"participants": list(people.entries())}
     data = groups(study, analysis.cohort, analysis.aggregate.posteriors, seed=seed)
     write_groups(data, folder / "inference.nc")
     write_grid(content, map_dataset(study, analysis.aggregate.surface), folder)
