@@ -37,6 +37,8 @@ from hilbo.study.robustness.optimised import FixedAndOptimised, fixed_and_optimi
 
 __all__ = ["Analysis", "Reading", "analyse", "limits_of", "moved_by_evidence"]
 
+_NAMED = 20  # participants in a sentence
+
 
 class Reading(NamedTuple):
     """A population map with the tolerance interval of each parameter and the bootstrap of its ends."""
@@ -124,6 +126,12 @@ def analyse(
     )
 
 
+def _first(texts: list[str]) -> str:
+    """The first texts, and how many more there are."""
+    more = len(texts) - _NAMED
+    return ", ".join(texts[:_NAMED]) + (f" and {more:,} more" if more > 0 else "")
+
+
 def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
     """Sentences on the limits of the data: a single participant, few or unequal numbers of responses, participants who
     gave one response only, fewer trials than planned."""
@@ -135,7 +143,7 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
         )
     few = [name for name, count in zip(cohort.names, counts, strict=True) if count < 5]
     if few:
-        sentences.append(f"Fewer than 5 answers were given by {', '.join(few)}; their maps are nearly the prior.")
+        sentences.append(f"Fewer than 5 answers were given by {_first(few)}; their maps are nearly the prior.")
     if counts.min() != counts.max():
         sentences.append(
             f"Participants gave between {counts.min()} and {counts.max()} answers; after n trials, those with fewer"
@@ -148,7 +156,7 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
         if len(np.unique(q[j][mask[j]])) == 1
     ]
     if one:
-        sentences.append(f"One answer only was ever given by {', '.join(one)}: that is no map of where to go.")
+        sentences.append(f"One answer only was ever given by {_first(one)}: that is no map of where to go.")
     planned = study.file.selection.trials
     if counts.max() < planned:
         sentences.append(f"The study plans {planned} trials; the largest number of responses is {counts.max()}.")
