@@ -75,10 +75,10 @@ def judged_sentences(judged: Judged) -> list[str]:
     again, error = np.atleast_1d(np.asarray(judged.again)), np.atleast_1d(np.asarray(judged.error))
     if not again.any():
         return []
-    whose = "" if len(again) == 1 else f" of {again.sum()} people"
+    whose = "" if len(again) == 1 else f" of {again.sum()} participants"
     return [
-        f"Laplace's evidence{whose} was off by {np.max(np.abs(error[again])):.2g} nats an answer at the hyperparameters"
-        f" that it chose (more than {TRUSTED:g}): they were learnt by expectation propagation instead."
+        f"Laplace's evidence{whose} was off by {np.max(np.abs(error[again])):.2g} nats per response at the"
+        f" hyperparameters that it chose (more than {TRUSTED:g}): they were learnt by expectation propagation instead."
     ]
 
 

@@ -68,7 +68,7 @@ def test_only_those_who_were_misjudged_are_named():
     error, again = jnp.array([0.01, -0.2, 0.09]), jnp.array([False, True, True])
     everybody = MaximumEvidence(model(0.7), error, error.astype(int), again, again, ("noise",))
     (sentence,) = judged_sentences(Judged(everybody, error, again))
-    assert sentence.startswith("Laplace's evidence of 2 people was off by 0.2 nats an answer")
+    assert sentence.startswith("Laplace's evidence of 2 participants was off by 0.2 nats per response")
 
 
 def test_without_any_response_nothing_is_misjudged(monkeypatch):

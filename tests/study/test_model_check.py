@@ -60,7 +60,7 @@ def test_repeats_that_agree_too_often_are_spoken_of(checked):
     _, _, content = checked
     told = content | {"repeats": {"pairs": 40, "given": 0.95, "predicted": 0.6, "implied": 0.03, "clustered": 0.02}}
     (said,) = check_sentences(told)
-    assert "the same answer in 95 % of 40 pairs, and 60 % were predicted" in said
+    assert "test-retest agreement is 95 % of 40 pairs of repeated stimuli and was predicted as 60 %" in said
 
 
 def test_what_fits_is_not_spoken_of(checked):
@@ -85,7 +85,7 @@ def test_a_model_that_does_not_fit_is_spoken_of(checked):
     assert content["shares"]["good"]["given"] == 0.0
     (said,) = check_sentences(content)
     assert said.startswith("With the study's hyperparameters the model does not fit")
-    assert '0 % of their answers were "good", and' in said
+    assert 'the proportion of "good" is 0 % and was predicted as' in said
     assert "the same shares everywhere would predict better" in said
 
 

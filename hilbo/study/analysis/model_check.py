@@ -81,23 +81,24 @@ def check_sentences(content: Content | None) -> list[str]:
     repeats = content["repeats"]
     limits = _limits(len(content["shares"]) + (repeats is not None) + len(_BASELINES), len(content["by_person"]))
     wrong = [
-        f'{_percent(row["given"])} of their answers were "{label}", and {_percent(row["predicted"])} were predicted'
+        f'the proportion of "{label}" is {_percent(row["given"])} and was predicted as {_percent(row["predicted"])}'
         for label, row in content["shares"].items()
         if _differs(row, limits)
     ]
     if repeats is not None and _differs(repeats, limits):
         wrong.append(
-            f"repeated renderings got the same answer in {_percent(repeats['given'])} of {repeats['pairs']} pairs, and"
-            f" {_percent(repeats['predicted'])} were predicted"
+            f"test-retest agreement is {_percent(repeats['given'])} of {repeats['pairs']} pairs of repeated stimuli and"
+            f" was predicted as {_percent(repeats['predicted'])}"
         )
     for name, words in _BASELINES.items():
         row = content["negative_log_density"][name]
         if row["difference"] < -limits.student * row["error"]:
-            wrong.append(f"{words} would predict better ({-row['difference']:.3f} ± {row['error']:.3f} nats an answer)")
+            gain = f"{-row['difference']:.3f} ± {row['error']:.3f} nats per response"
+            wrong.append(f"{words} would predict better ({gain})")
     if not wrong:
         return []
     by = "the study's hyperparameters" if content["hyperparameters"] == "as stated" else "the learnt hyperparameters"
-    return [f"With {by} the model does not fit people who were left out and predicted: {'; '.join(wrong)}."]
+    return [f"With {by} the model does not fit the responses of left-out participants: {'; '.join(wrong)}."]
 
 
 class _Limits(NamedTuple):
