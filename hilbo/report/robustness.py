@@ -206,7 +206,8 @@ def _percentiles(draws):
 
 def _warnings(check):
     """Warnings as sentences: a correlation length below a tenth of a search range, an optimised model by which the
-    goal is nowhere the likeliest response, and a search that did not converge.
+    goal is nowhere the most probable response, a search that did not converge or ran to extreme values, and, of a
+    method that learns, hyperparameters that the responses do not determine.
     """
     both = check.hyperparameters
     alike, sentences = _correlation(both.optimised), []
