@@ -220,7 +220,7 @@ def _warnings(check):
     goal = both.optimised.goal.category
     if np.argmax(chances) != goal:
         sentences.append(
-            f'Under the optimised hyperparameters "{both.optimised.goal_label}" is not the likeliest answer of a new'
-            f" participant, even at the optimum ({100 * chances[goal]:.0f} %)."
+            f'Under the optimised hyperparameters "{both.optimised.goal_label}" is not the most probable response of'
+            f" a new participant, even at the optimum ({100 * chances[goal]:.0f} %)."
         )
     return [*sentences, *both.limits, *learnt_sentences(both.optimised)]
