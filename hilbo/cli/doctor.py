@@ -229,8 +229,8 @@ def _step(study: Any) -> Check:
 
 
 def _device(connect: Callable[[float | None, float | None], Any], file: Any) -> Iterator[Check]:
-    """Checks of the device: connection, loopback and, for the study `file`, damping and delay. One failed check if it
-    cannot be connected."""
+    """Checks of the device: connection, loopback and, for the study `file`, its damping and delay against the device's,
+    which is connected without them and closed again. One failed check if it cannot be connected."""
     from hilbo.device.failures import DeviceError
 
     mechanics = file.space.mechanics if file is not None else None

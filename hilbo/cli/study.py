@@ -158,7 +158,9 @@ def report(
         from hilbo.study.folder import read_folder
 
         listed = None if people is None else read_people(people)
-        content = write_study(read_folder(folder, exclude), destination, seed, say, comparison=compare, people=listed)
+        content = write_study(
+            read_folder(folder, exclude), destination, seed, say, comparison=compare, people=listed, count=say
+        )
     finish(content, out, as_json)
 
 
@@ -176,7 +178,7 @@ def simulated_report(folder: Path, seed: int, say: Callable[..., None], count: i
     say("simulating")
     (simulated,) = simulate_folder(folder, "paper", count, seed)
     (material,) = read_folder(folder).materials
-    analysis = analyse(material.study, material.cohort, seed, say)
+    analysis = analyse(material.study, material.cohort, seed, say, count=say)
     if analysis.sets is not None:
         say("simulated validation sessions")
         individual_optima = np.asarray(analysis.aggregate.individuals.x)

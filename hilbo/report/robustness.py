@@ -205,9 +205,8 @@ def _percentiles(draws):
 
 
 def _warnings(check):
-    """Warnings as sentences: a correlation length below a tenth of a search range, an optimised model by which the
-    goal is nowhere the most probable response, a search that did not converge or ran to extreme values, and, of a
-    method that learns, hyperparameters that the responses do not determine.
+    """Warnings as a list of sentences: a correlation below 0.1 between points a tenth of a search range apart, a goal
+    that is not the most probable response at the optimised optimum, and those on the search and the learnt model.
     """
     both = check.hyperparameters
     alike, sentences = _correlation(both.optimised), []

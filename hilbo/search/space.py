@@ -195,8 +195,9 @@ class SearchSpace(eqx.Module):
     def from_box(self, w: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
         """Optimiser's coordinates in [0, 1]^d to the unit cube; differentiable.
 
-        In a column without a feasible point x_K1 is 0 and `feasible` says no.
-        (..., d) -> (..., d).
+        With mechanics K1 is mapped to its feasible column; in one without a feasible point x_K1 is 0. Other
+        inequalities are not enforced, and a dependent coordinate may lie outside [0, 1]: ask `feasible`. (..., d) -> (..., d).
+        Raises `InputError` for another number of coordinates.
         """
         self._check_axis(w)
         w = _on_device(w)

@@ -220,7 +220,8 @@ def _material(
 
 def _answers(name: str, study: Study, tables: Mapping[Path, list[pd.DataFrame]]) -> TrialTable:
     """A material's responses of all trial tables as one. A table without a response to fit is left out with a warning;
-    if all are such, NothingToFitError is raised."""
+    if all are such, NothingToFitError is raised. At least one table has the material; duplicates are not
+    looked for. Raises InputError for an invalid table."""
     read, empty = [], []
     for path, pieces in tables.items():
         if name in _materials_named(pieces):
@@ -308,8 +309,8 @@ def _departures(
     folder: Path, study: Study, materials: list[Material], held: list[SessionRow] | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Compare the sessions with the plans in plan.json or plan-*.json; returns (sentences on deviations, sentences that
-    confirm a plan); both are empty without a plan. Responses excluded for their flags are counted too. Raises
-    InputError."""
+    confirm a plan); both are empty without a plan. Responses excluded for their flags are counted too. `held`:
+    the sessions, None if not known. Raises InputError for a plan that cannot be read or is of another study."""
     plans = {path: read_plan(path) for path in sorted([*folder.glob("plan.json"), *folder.glob("plan-*.json")])}
     for path, plan in plans.items():
         if plan.meaning != study.file.meanings(plan.materials):

@@ -94,7 +94,7 @@ def test_robustness_writes_its_check(capsys, monkeypatch, tmp_path):
     assert content["learned"]["parameters"] == ["theta", "noise"]
     assert np.isfinite(content["nrmse"])
     page = " ".join((out / "report.html").read_text().split())
-    assert "robust" in page and "The rule is bcm in both" in page and page.count("data:image/png;base64,") == 2
+    assert "robust" in page and "both by the method bcm" in page and page.count("data:image/png;base64,") == 2
     assert all((out / f"{name}.{kind}").stat().st_size for name in ("maps", "moves") for kind in ("png", "svg"))
     data = xr.load_dataset(out / "map.nc", engine="h5netcdf")
     assert data["hyperparameters"].values.tolist() == ["fixed", "by evidence"]

@@ -57,11 +57,11 @@ HILL = [(u, v, 2 - (abs(u - 0.4) > 0.2) - (abs(v - 0.5) > 0.25)) for u in (0.1, 
 def test_limits_are_named():
     study = plain()
     limits = limits_of(study, crowd([HILL, HILL[:2], [(0.1, 0.1, 0)] * 6]))
-    assert limits[0].startswith("Fewer than 5 answers were given by P1")
+    assert limits[0].startswith("Fewer than 5 responses are from P1")
     assert "between 2 and 9" in limits[1] and 'P2 ("different")' in limits[2]
     assert "plans 25 trials; the largest number of responses is 9" in limits[3]
     assert limits_of(study, crowd([HILL]))[0].startswith(
-        "P0 is the only participant: the population map is that person's own,"
+        "P0 is the only participant: the population map is that participant's,"
     )
 
 

@@ -231,7 +231,7 @@ async def _map(hub: Served, _role: Role, _request: Request) -> Response:
 
 
 def _json_of(content: Callable[[Any], Awaitable[Any]]) -> Callable:
-    """A handler whose JSON response is that of the async function `content(hub)`."""
+    """A handler (hub, role, request) whose JSON response is that of the async function `content(hub)`."""
 
     async def handle(hub: Served, _role: Role, _request: Request) -> Response:
         return _json(await content(hub))

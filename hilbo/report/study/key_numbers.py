@@ -70,7 +70,8 @@ def key_numbers_words(table: pd.DataFrame) -> list[list[str]]:
 
 
 def _errors(analysis: Analysis, reference: Reference) -> Iterator[KeyNumber]:
-    """NRMSE to the reference of the population optimum, the individual optima and their mean."""
+    """Three rows, NRMSE to the reference in %: the population optimum, the individual optima (median and quartiles) and
+    their mean; the first and the last with the range of errors to sets within the reference's interval, if any."""
     study, aggregate = analysis.study, analysis.aggregate
 
     def error(key: str, what: str, x: Float[np.ndarray, " d"]) -> KeyNumber:

@@ -31,6 +31,7 @@ from hilbo.report.study.study_figures import comparison_figures, study_figures
 from hilbo.report.validation import Validated, folder_names, named_warnings, validate
 from hilbo.study.analysis.analysis import Analysis, analyse, moved_by_evidence
 from hilbo.study.analysis.heterogeneity import how_aggregated
+from hilbo.study.estimate.aggregate import SayCount, silent
 from hilbo.study.file.trial_flags import flag_sentences
 from hilbo.study.folder import Material, StudyFolder
 from hilbo.study.results.arviz_groups import groups, predictive_shares, write_groups
@@ -47,13 +48,15 @@ def write_study(
     analyses: Mapping[str, Analysis] | None = None,
     comparison: bool = True,
     people: Mapping[str, Mapping[str, str]] | None = None,
+    count: SayCount = silent,
 ) -> dict[str, Any]:
     """Analyse a study's folder and write the results of `hilbo report` into the existing folder `out`; return the
     content of result.json.
 
-    `say`: called with a text at each step; `analyses`: finished analyses by name of the material, which are not
-    repeated; `comparison`: whether the other ones also compare the aggregation methods; `people`: participant -> row of
-    participants.csv, of which only a summary is written. Raises `InputError` for data that cannot be analysed.
+    `say`: called with a text at each step, `count` with the progress of long ones; `analyses`: finished analyses by name
+    of the material, which are not repeated; `comparison`: whether the other ones also compare the aggregation methods;
+    `people`: participant -> row of participants.csv, of which only a summary is written. Raises `InputError` for data
+    that cannot be analysed.
     """
     results, contents, sections = [], {}, []
     analyses = {} if analyses is None else analyses
@@ -65,7 +68,7 @@ def write_study(
             say(f"{text}{words}")
 
         analysis = analyses.get(material.name) or analyse(
-            material.study, material.cohort, seed, tell, comparison=comparison
+            material.study, material.cohort, seed, tell, comparison=comparison, count=count
         )
         validated = _validated(material, folder, tell)
         results.append(Results(material.name, analysis, validated, material.reference))

@@ -184,7 +184,8 @@ def _rendered(mechanics) -> dict[str, Any]:
 
 
 def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """Table of all proposed trials, one row each, with status, number of presentations, and why it was voided."""
+    """Table of all proposed trials, one row each, with status, number of presentations, times, and why and by whom it
+    was voided. Without trials it has no columns; `material` and `response_time` are missing where no row has one."""
     rows = []
     for state in sessions:
         for trial in state.trials:

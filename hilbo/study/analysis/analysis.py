@@ -27,7 +27,7 @@ from hilbo.study.analysis.rule_comparison import FEWEST, compare
 from hilbo.study.analysis.tolerance import Ends, Tolerance, tolerance, tolerance_ends
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.estimate.aggregate import Aggregate, aggregate_cohort
+from hilbo.study.estimate.aggregate import Aggregate, SayCount, aggregate_cohort, silent
 from hilbo.study.estimate.learnt import learnt_sentences, resolved, that_learns
 from hilbo.study.estimate.location import goal_sentences, location_sentences
 from hilbo.study.estimate.optimum import map_optimum
@@ -89,14 +89,20 @@ class Analysis(NamedTuple):
 
 
 def analyse(
-    study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda text: None, *, comparison: bool = False
+    study: Study,
+    everybody: Cohort,
+    seed: int = 0,
+    say: Say = lambda text: None,
+    *,
+    comparison: bool = False,
+    count: SayCount = silent,
 ) -> Analysis:
     """All results of one material. `everybody`: all its participants, before exclusion; `say`: called with a phrase at
-    the start of each step; `comparison`: also cross-validate all aggregation methods, which is the slowest step. Raises
-    `InputError` if all participants are excluded."""
+    the start of each step, `count` with the progress of those that take long; `comparison`: also cross-validate all
+    aggregation methods, which is the slowest step. Raises `InputError` if all participants are excluded."""
     say("estimating response quality (consistency, lapses, drift)")
     cohort, people, left_out = included(study, everybody)
-    population = _with_learnt(analyse_cohort(study, cohort, seed, say), seed, say)
+    population = _with_learnt(analyse_cohort(study, cohort, seed, say, count=count), seed, say)
     study, aggregate = population.study, population.aggregate
     say("optimising the hyperparameters (maximum evidence)")
     both = fixed_and_optimised(study, cohort)
@@ -138,16 +144,16 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
     counts, sentences = cohort.counts(), []
     if len(cohort.names) == 1:
         sentences.append(
-            f"{cohort.names[0]} is the only participant: the population map is that person's own, and nothing is known"
-            " of how people differ."
+            f"{cohort.names[0]} is the only participant: the population map is that participant's, and nothing is known"
+            " of individual differences."
         )
     few = [name for name, count in zip(cohort.names, counts, strict=True) if count < 5]
     if few:
-        sentences.append(f"Fewer than 5 answers were given by {_first(few)}; their maps are nearly the prior.")
+        sentences.append(f"Fewer than 5 responses are from {_first(few)}; their maps are nearly the prior.")
     if counts.min() != counts.max():
         sentences.append(
-            f"Participants gave between {counts.min()} and {counts.max()} answers; after n trials, those with fewer"
-            " enter with what they have."
+            f"Participants have between {counts.min()} and {counts.max()} responses; after n trials, those with fewer"
+            " enter with all that they have."
         )
     mask, q = np.asarray(cohort.trials.mask), np.asarray(cohort.trials.q)
     one = [
@@ -156,7 +162,7 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
         if len(np.unique(q[j][mask[j]])) == 1
     ]
     if one:
-        sentences.append(f"One answer only was ever given by {_first(one)}: that is no map of where to go.")
+        sentences.append(f"All responses are the same of {_first(one)}: such a map has no direction of improvement.")
     planned = study.file.selection.trials
     if counts.max() < planned:
         sentences.append(f"The study plans {planned} trials; the largest number of responses is {counts.max()}.")

@@ -140,8 +140,8 @@ def _bisect(
     outer: float,
     scale: ScaleUse | None,
 ) -> tuple[float, float]:
-    """Narrow down an interval's end between a value inside and one outside, by 40 bisections; returns both, inside
-    first."""
+    """Narrow down an interval's end between a value inside and one outside (unit scale), by 40 bisections; returns
+    both, inside first."""
     for _ in range(_HALVINGS):
         middle = (inner + outer) / 2
         if _tolerated(study, predict, x, parameter, jnp.asarray([middle], x.dtype), scale)[0]:

@@ -154,8 +154,8 @@ def enclosing(path: str, place: str) -> Iterator[str]:
 
 
 def lines_of(text: str) -> dict[str, int]:
-    """Line number (from 1) of every table and key in the text of a TOML file, by key path; [[tables]] are numbered from
-    1."""
+    """Line number (from 1) of each table header and each key at the beginning of a line in the text of a TOML file, by
+    path, such as "parameters.1.low"; [[tables]] count from 1. Keys of inline tables are not listed."""
     lines, table, counts = {}, "", Counter()
     for number, line in enumerate(text.splitlines(), 1):
         if header := re.match(r"\s*\[([^\[\]]+)\]", line):

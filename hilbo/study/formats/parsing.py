@@ -37,8 +37,8 @@ def toml(text: str, source: str) -> dict[str, object]:
 
 
 def check_parsed(raw: object) -> None:
-    """Raise `InputError`, which begins with the key's path, for tables nested more than 20 deep and integers of 64 bits
-    or more."""
+    """Raise `InputError`, which begins with the key's path, for lists or tables nested more than 20 deep and
+    integers of 64 bits or more."""
     pending: list[tuple[str, object, int]] = [("", raw, 0)]
     while pending:
         path, value, depth = pending.pop()

@@ -141,7 +141,8 @@ def _at(study: Study, aggregate: Aggregate, x: Float[Array, " d"]) -> Optimum:
 
 
 def _place(optimum: Optimum, goal: Goal, cohort: Cohort, levels: tuple[int, ...]) -> Place:
-    """An optimum with the number of responses near it."""
+    """An optimum with the number of responses within an NRMSE of `NEAR`, and how many of them were the goal. `levels`:
+    of the study's kernel."""
     mask = np.asarray(cohort.trials.mask)
     away = np.asarray(nrmse(np.asarray(cohort.trials.x), np.asarray(optimum.x), levels))
     answers = np.asarray(cohort.trials.q)[mask & (away <= NEAR)]
