@@ -65,12 +65,9 @@ _SHAPES = {"hold": 0, "triangle": 1, "step": 2, "nudge": 3}
 class Renderer:
     """Connected device; `device` is its description (`HelloReply`), `notes` are messages for the user.
 
-    `damping` (N·s/m) and `delay` (s) are those that a study assumes, None unchecked: a device with less damping or a
-    longer delay is refused. Connecting stops a moving device and starts heartbeats and telemetry.
-
-    `simulator` is the `Simulator` behind a simulated device, else None. Construct with `open`. Every method raises
-    `RefusalError` (an `InputError`) for numbers the device refuses, and `DeviceError` when device or line fail, each
-    with one sentence on what to do.
+    `damping` (N·s/m) and `delay` (s): as a study assumes, None unchecked; a device with less damping or more delay is
+    refused. `simulator`: behind a simulated device, else None. Construct with `open`. Every method raises
+    `RefusalError` (an `InputError`) for numbers the device refuses, and `DeviceError` when device or line fail.
     """
 
     def __init__(

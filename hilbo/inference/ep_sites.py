@@ -72,8 +72,8 @@ def coupling(sites: Sites, posterior: Joint, variance: Vector) -> tuple[Matrix, 
     """Matrices W, Q and J of Newton's step, (n, n) each.
 
     W: derivative of the means by the cavity variances; Q: minus that of these by the precisions; J = I + Q (dt/dv +
-    dt/dm W). The means' equation has the inverse diag(1 + v t) (I - S T); dv_i = -(s_i / left_i s_i)^2 sum_{j != i} S_ij^2 dt_j.
-    `variance` (n,): of the cavities.
+    dt/dm W). The means' equation has the inverse diag(1 + v t) (I - S T); dv_i = -(1 / left_i)^2 sum_{j != i} S_ij^2
+    dt_j. `variance` (n,): of the cavities.
     """
     eye = jnp.eye(variance.shape[0], dtype=variance.dtype)
     from_slopes = posterior.covariance * sites.slope_v[None, :]

@@ -196,8 +196,8 @@ class SearchSpace(eqx.Module):
         """Optimiser's coordinates in [0, 1]^d to the unit cube; differentiable.
 
         With mechanics K1 is mapped to its feasible column; in one without a feasible point x_K1 is 0. Other
-        inequalities are not enforced, and a dependent coordinate may lie outside [0, 1]: ask `feasible`. (..., d) -> (..., d).
-        Raises `InputError` for another number of coordinates.
+        inequalities are not enforced, and a dependent coordinate may lie outside [0, 1]: ask `feasible`.
+        (..., d) -> (..., d). Raises `InputError` for another number of coordinates.
         """
         self._check_axis(w)
         w = _on_device(w)

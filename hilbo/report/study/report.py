@@ -53,9 +53,9 @@ def write_study(
     """Analyse a study's folder and write the results of `hilbo report` into the existing folder `out`; return the
     content of result.json.
 
-    `say`: called with a text at each step, `count` with the progress of long ones; `analyses`: finished analyses by name
-    of the material, which are not repeated; `comparison`: whether the other ones also compare the aggregation methods;
-    `people`: participant -> row of participants.csv, of which only a summary is written. Raises `InputError` for data
+    `say`: called with a text at each step, `count` with the progress of long ones; `analyses`: finished analyses by
+    name of the material, which are not repeated; `comparison`: whether the other ones also compare the aggregation
+    methods; `people`: participant -> row of participants.csv, of which only a summary is written. Raises `InputError` for data
     that cannot be analysed.
     """
     results, contents, sections = [], {}, []
