@@ -43,11 +43,11 @@ def _print_demo(real: dict[str, Any], simulated: dict[str, Any], out: Path) -> N
 
     console = Console(highlight=False, soft_wrap=True)
     best = real["optimum"]["parameters"]
-    console.print(f"\nVideo quality, {len(real['participants'])} people: the map is highest at", end=" ")
+    console.print(f"\nVideo quality, {len(real['participants'])} participants: the map is highest at", end=" ")
     console.print(", ".join(f"{name} = {value:.0f}" for name, value in best.items()) + ".\n")
     truth = simulated["truth"]
     table = RichTable(
-        title="Simulated memory foam, 24 people x 25 trials: NRMSE to the truth, of the search ranges",
+        title="Simulated memory foam, 24 participants x 25 trials: NRMSE to the truth, of the search ranges",
         box=box.SIMPLE_HEAD,
         title_justify="left",
         pad_edge=False,
@@ -72,6 +72,10 @@ def _print_demo(real: dict[str, Any], simulated: dict[str, Any], out: Path) -> N
     console.print(table)
     console.print("Individuals: median and quartiles. Passivity margin: excess damping in N.s/m.")
     top = truth["top_answers"]
-    console.print(f'"close" answers of 25: {top["mean"]:.2f} ± {top["sd"]:.2f} (paper: 5.96 ± 4.47)\n')
+    console.print(f'"close" responses of 25: {top["mean"]:.2f} ± {top["sd"]:.2f} (paper: 5.96 ± 4.47)')
+    console.print(
+        "This is one study with one seed. Over three thousand simulated studies of 24 x 25 the median error is 8.8 % by"
+        f" bcm and 4.5 % by {RECOMMENDED} (docs/methods/which_method.md).\n"
+    )
     for name in PARTS:
         console.print(str(out / name / "report.html"))
