@@ -55,8 +55,8 @@ def write_study(
 
     `say`: called with a text at each step, `count` with the progress of long ones; `analyses`: finished analyses by
     name of the material, which are not repeated; `comparison`: whether the other ones also compare the aggregation
-    methods; `people`: participant -> row of participants.csv, of which only a summary is written. Raises `InputError` for
-    data that cannot be analysed.
+    methods; `people`: participant -> row of participants.csv, of which only a summary is written. Raises `InputError`
+    for data that cannot be analysed.
     """
     results, contents, sections = [], {}, []
     analyses = {} if analyses is None else analyses
