@@ -68,7 +68,7 @@ def test_limits_are_named():
 def test_limits_name_twenty_participants_and_count_the_others():
     few, one = limits_of(plain(), crowd([HILL[:1]] * 1023))[:2]
     assert "P0, P1" in few and "P19 and 1,003 more; their maps" in few and "P20" not in few + one
-    assert one.endswith('P19 ("different") and 1,003 more: that is no map of where to go.')
+    assert one.endswith('P19 ("different") and 1,003 more: such maps have no direction of improvement.')
 
 
 def test_halves_share_nobody_and_people_are_held_against_the_half_without_them():

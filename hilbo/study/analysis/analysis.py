@@ -162,7 +162,7 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
         if len(np.unique(q[j][mask[j]])) == 1
     ]
     if one:
-        sentences.append(f"All responses are the same of {_first(one)}: such a map has no direction of improvement.")
+        sentences.append(f"The responses do not vary for {_first(one)}: such maps have no direction of improvement.")
     planned = study.file.selection.trials
     if counts.max() < planned:
         sentences.append(f"The study plans {planned} trials; the largest number of responses is {counts.max()}.")
