@@ -280,7 +280,7 @@ def _stimulus(file: Any) -> Iterator[Check]:
         words = f"{len(left)} speak of feeling a device: {', '.join(left)}" if left else "the study's own"
         yield _check("participants' texts", words, bool(left) and "write your own in [session.texts]", "note")
     number = file.session.protocol_number
-    fix = "write [session] protocol_number, so that it is compared with what people agreed to"
+    fix = "write [session] protocol_number, so that it is compared with that of the consent"
     yield _check("protocol number", number or "the study names none", not number and fix, "note")
 
 

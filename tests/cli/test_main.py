@@ -181,7 +181,7 @@ def test_simulate_keeps_what_it_simulated(capsys, monkeypatch, tmp_path):
     out = tmp_path / "out"
     arguments = ["simulate", "--participants", "2", "--study", tmp_path / "short.toml", "--out", out]
     code, _, stderr = run(capsys, monkeypatch, *arguments)
-    assert code == 0 and stderr.count("The true optimum of these simulated people is K1 = ") == 1
+    assert code == 0 and stderr.count("The true optimum of the simulated participants is K1 = ") == 1
     assert (out / "study.toml").read_text() == text
     assert pd.read_csv(out / "truth.csv")["source"].tolist() == ["population", "individual:P01", "individual:P02"]
     content = json.loads((out / "result.json").read_text())

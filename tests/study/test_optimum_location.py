@@ -98,5 +98,7 @@ def test_a_row_of_a_table_has_the_same_in_a_few_words():
 
 def test_a_simulated_study_says_how_far_its_truth_is():
     sentence = truth_sentence(STUDY, np.asarray(STUDY.space.to_unit(np.array([8.0, 4.0, 0.25]))), 0.0844)
-    assert sentence.startswith("The true optimum of these simulated people is K1 = 8 N/mm, B1 = 4 N.s^alpha/mm, alpha")
+    assert sentence.startswith(
+        "The true optimum of the simulated participants is K1 = 8 N/mm, B1 = 4 N.s^alpha/mm, alpha"
+    )
     assert sentence.endswith("= 0.25; the optimum found is 8.4 % of the search ranges away (NRMSE).")

@@ -43,7 +43,7 @@ def truth_sentence(study: Study, truth: Float[np.ndarray, " d"], nrmse: float) -
     """Sentence with the true optimum of a simulated study, `truth` (d,) in the unit cube, in physical units, and the
     distance of the estimate, `nrmse`, in %."""
     far = f"the optimum found is {100 * nrmse:.1f} % of the search ranges away (NRMSE)"
-    return f"The true optimum of these simulated people is {_rendering(study, truth)}; {far}."
+    return f"The true optimum of the simulated participants is {_rendering(study, truth)}; {far}."
 
 
 def _rendering(study: Study, x: Float[ArrayLike, " d"]) -> str:
