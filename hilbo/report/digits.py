@@ -40,9 +40,10 @@ def parameter_text(study: Study, name: str, value: float | str, spread: float = 
         return value
     parameter = next((p for p in study.space.parameters if p.name == name), None)
     if parameter is not None and parameter.discrete:
-        return "–" if np.isnan(value) else f"{value:g}"
+        return "–" if np.isnan(value) else np.format_float_positional(float(f"{value:.12g}"), trim="-")
     if np.isfinite(spread) and spread > 0:
-        return rounded(value, spread)
+        log = parameter is not None and parameter.scale == "log" and value > 0
+        return rounded(value, min(spread, value) if log else spread)  # two digits of the value at least
     if parameter is None:
         return rounded(value, _SHARE * K0_range(study.space))
     if parameter.scale == "log":

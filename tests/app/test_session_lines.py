@@ -35,7 +35,7 @@ def test_a_whole_session():
             driver.do(doing, 1)
     lines, of = lines_of(driver), sum(block.count for block in driver.state.header.blocks)
     assert driver.state.screen == "done" and lines[0] == "The participant has begun."
-    assert lines[-1] == "All trials have a response. Ctrl-C ends the server; then hilbo export"
+    assert lines[-1] == "No trial is left. Ctrl-C ends the server; then hilbo export"
     counts = [int(line.split()[0]) for line in lines if line.endswith(f"of {of} responses.")]
     assert len(counts) == 3 and all(count >= part * of / 4 for part, count in enumerate(counts, 1))
     assert lines.count(lines[0]) == lines.count(lines[-1]) == 1

@@ -50,7 +50,7 @@ def line_of(before: LiveSession, event: Event, after: LiveSession, export: str) 
     `export`: the command that makes tables of the logs.
     """
     if after.screen == "done" and before.screen != "done":
-        return f"All trials have a response. Ctrl-C ends the server; then {export}"
+        return f"No trial is left. Ctrl-C ends the server; then {export}"
     match event.kind:
         case "device" | "abort" | "pause" | "resume":
             return sentence(after, event)

@@ -62,7 +62,8 @@ def table_1_rows(study: Study, table: pd.DataFrame) -> tuple[list[str], list[lis
                 cells.append(f"{row[column]:.1f}")
             else:
                 spread = sd if column in ("mean_of_optima", "sd_of_optima") else np.nan
-                cells.append(parameter_text(study, name, row[column], spread))
+                is_sd = column == "sd_of_optima"
+                cells.append(rounded(row[column], sd) if is_sd else parameter_text(study, name, row[column], spread))
         rows.append(cells)
     return list(map(str, table.columns)), rows
 
